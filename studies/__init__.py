@@ -1,6 +1,6 @@
 """Studies of cfplan: each measures one thing, makes one result with its tables, and is one command.
 
-Run one by `python -m studies NAME`. Studies need a checkout; cfplan itself needs none of them.
+Run one with `python -m studies NAME`. Studies need a checkout; cfplan itself needs none of them.
 """
 
 STUDIES = {

@@ -1,7 +1,7 @@
-"""Draw paths that are hard to plan, by seeds: families of them, and limits from a hundredth to ten times the usual.
+"""Draw paths that are hard to plan, by seed, from several families, with limits 0.01 to 10 times the usual ones.
 
-What is drawn is what people bring (exported lines of points, recordings by hand, laps, drawings with corners) and what
-lies at the edge of it: two centimetres, a kilometre, a thousand points.
+The families cover what users bring (exported point lists, hand recordings, laps, drawings with corners) and extremes:
+two centimetres, a kilometre, a thousand points.
 """
 
 import math
@@ -18,10 +18,10 @@ from cfplan.geometry.random_paths import generator
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.limits import PlanLimits
 
-FACTORS = (0.01, 10.0)  # on the limits
+FACTORS = (0.01, 10.0)  # range of the factors on the limits
 SCALED = ("speed", "acceleration", "angular_velocity", "angular_acceleration")
-STEEPEST = math.radians(80.0)  # tilt that is drawn at most
-MOST_TIME = 1800.0  # s that a path takes at its speed limit, at most: slower ones are drawn again
+STEEPEST = math.radians(80.0)  # rad, largest tilt drawn
+MOST_TIME = 1800.0  # s at the speed limit; the limits of slower paths are drawn again
 Draw = Callable[[np.random.Generator], NDArray]
 
 
@@ -32,14 +32,14 @@ class AdversarialPath:
     family: str
     seed: int
     points: NDArray  # (K, 3) m
-    through: Callable[[NDArray], Path]  # how a path is laid through them
+    through: Callable[[NDArray], Path]  # builds the path through the points
     yaw: YawMode
     limits: PlanLimits
     factor: float  # on the limits; the geometric mean where each has its own
 
     @property
     def path(self) -> Path:
-        """Return the path. Raises InputError where the points make none."""
+        """Return the path. Raises InputError if the points do not define one."""
         path = self.through(self.points)
         path.check()
         return path
@@ -54,7 +54,7 @@ def adversarial_path(seed: int, usual: PlanLimits) -> AdversarialPath:
     factors = np.ones(len(SCALED))
     while True:
         factors = np.exp(random.uniform(math.log(FACTORS[0]), math.log(FACTORS[1]), size=len(SCALED)))
-        if random.random() < 0.75:  # all by the same
+        if random.random() < 0.75:  # one factor for all limits
             factors[:] = factors[0]
         limits = replace(
             usual, **{name: float(f) * getattr(usual, name) for name, f in zip(SCALED, factors, strict=True)}
@@ -72,7 +72,7 @@ def adversarial_path(seed: int, usual: PlanLimits) -> AdversarialPath:
 
 
 def _rounded(points: NDArray, random: np.random.Generator) -> NDArray:
-    """Return the points as files have them: of half of them exact, of the others to a tenth of a millimetre or so."""
+    """Return the points as a file would hold them: half the time exact, otherwise rounded to 1 mm to 10 µm."""
     digits = random.integers(3, 6)
     return points if random.random() < 0.5 else np.round(points, digits)
 
@@ -94,7 +94,7 @@ def _along(points: NDArray, spacing: float) -> NDArray:
 
 
 def _turned(points: NDArray, random: np.random.Generator) -> NDArray:
-    """Return the points turned about the vertical, and 1 m up."""
+    """Return the points rotated about the vertical by a random angle and raised by 1 m."""
     angle = random.uniform(0, 2 * math.pi)
     turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
     return points @ turn.T + [0, 0, 1]
@@ -117,7 +117,7 @@ def _dense_line(random: np.random.Generator) -> NDArray:
     spacing = random.uniform(0.003, 0.012)
     count = int(random.integers(100, 700))
     points = np.column_stack([spacing * np.arange(count), np.zeros(count), np.zeros(count)])
-    if random.random() < 0.5:  # as a hand or a camera measures it
+    if random.random() < 0.5:  # with noise, as if measured
         points = points + random.normal(size=points.shape) * 10 ** random.uniform(-5, -3.3)
     return _turned(_rounded(points, random), random)
 
@@ -130,7 +130,7 @@ def _coil(random: np.random.Generator) -> NDArray:
 
 
 def _twist(random: np.random.Generator) -> NDArray:
-    """Points that turn in every direction within little room."""
+    """Return points that turn in every direction within a small space."""
     size = np.exp(random.uniform(np.log(0.1), np.log(1.0)))
     return _turned(_apart(random.uniform(-size, size, size=(int(random.integers(8, 60)), 3)), 0.02), random)
 
@@ -143,7 +143,7 @@ def _hairpins(random: np.random.Generator) -> NDArray:
 
 
 def _corners(random: np.random.Generator) -> NDArray:
-    """Straight lines and right angles, drawn point by point."""
+    """Return straight lines and right angles, drawn point by point."""
     steps = random.integers(0, 2, size=int(random.integers(3, 12))) * 2 - 1
     heading, corners = 0.0, [np.zeros(3)]
     for turn in steps:
@@ -156,7 +156,7 @@ def _corners(random: np.random.Generator) -> NDArray:
 
 
 def _lollipop(random: np.random.Generator) -> NDArray:
-    """A line, a circle at its end, and the line back beside it."""
+    """Return a line, a circle at its end, and the line back beside it."""
     radius, stick = np.exp(random.uniform(np.log(0.05), np.log(1.0))), random.uniform(0.2, 5.0)
     spacing = np.exp(random.uniform(np.log(0.011), np.log(0.2)))
     angle = np.linspace(-math.pi + 0.2, math.pi - 0.2, max(6, int(6.0 * radius / spacing)))
@@ -172,7 +172,7 @@ def _thousand_points(random: np.random.Generator) -> NDArray:
 
 
 def _vertical(random: np.random.Generator) -> NDArray:
-    """Up, down, or up and down again beside it; at times with a hand's tremble."""
+    """Return a path up, down, or up and back down beside it; sometimes with hand tremor."""
     height, count = random.uniform(0.3, 10.0), int(random.integers(2, 40))
     up = np.column_stack([np.zeros(count), np.zeros(count), np.linspace(0, height, count)])
     beside = np.array([random.uniform(0.02, 1.0), 0.0, 0.0])

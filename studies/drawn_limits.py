@@ -1,10 +1,10 @@
-"""Draw limits, vehicles and paths by seeds: as the shipped network was trained on, and outside of that.
+"""Draw limits, vehicles and paths by seed: from the shipped network's training distribution, and outside it.
 
-Each of the network's training draws has its place among the twelve numbers that it sees of limits and vehicle, each
-number over its standard deviation in training. Its neighbourhood reaches as far as the nearest other training draw is
-away from 99 of 100 training draws. Two groups of draws lie outside every neighbourhood: one with vehicles, one with
-limits that nothing in training resembles. Paths are of all families, with yaw of all modes, of seeds that no dataset
-has.
+A draw is a point in the space of the twelve numbers that describe limits and vehicle to the network, each scaled by its
+standard deviation in training. The neighbourhood of a training draw is a ball whose radius is the 99th percentile of
+the distances from training draws to their nearest neighbours. Two groups of draws lie outside every neighbourhood: one
+with unusual vehicles, one with unusual limits. Paths are of all families and yaw modes, with seeds that no dataset
+uses.
 """
 
 import math
@@ -30,11 +30,11 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 _SEED = 99  # of the draws; datasets have other seeds
-_NEIGHBOURS = 0.99  # quantile of the distances from training draws to the nearest other one
-_UNUSUAL = 0.6  # fraction of the numbers of a draw outside that are unusual
-_TRIES = 1000  # draws until one lies outside
+_NEIGHBOURS = 0.99  # quantile of the distances from training draws to their nearest neighbours
+_UNUSUAL = 0.6  # fraction of a draw's numbers that come from an unusual range
+_TRIES = 1000  # draws before giving up
 
-# Below and above what draws.py draws for training.
+# Ranges below and above those that draws.py draws from for training.
 SPEED = ((0.1, 0.3), (8.0, 16.0))  # m/s
 ACCELERATION = ((0.3, 1.0), (20.0, 40.0))  # m/s²
 ANGULAR_VELOCITY = ((0.7, 2.0), (25.0, 50.0))  # rad/s
@@ -50,10 +50,10 @@ DRAG = ((0.8, 1.6),)  # 1/s
 
 
 class _Neighbourhoods:
-    """Where the network's training draws lie."""
+    """The neighbourhoods of the network's training draws."""
 
     def __init__(self, spec: DatasetSpec) -> None:
-        """Draw them again, from the dataset's seed."""
+        """Repeat the training draws from the dataset's seed."""
         drawn = np.array([_numbers(row_limits(spec, number)[0]) for number in range(spec.count)])
         self._spread = drawn.std(axis=0)
         self._tree = cKDTree(drawn / self._spread)
@@ -66,9 +66,9 @@ class _Neighbourhoods:
 
 
 def draw_case(group: str, seed: int) -> tuple[Path, LimitSet, YawMode, float]:
-    """Return the path, the limits, and the yaw with its angle, rad, of that seed in one of GROUPS.
+    """Return path, limits, yaw mode and yaw angle, rad, for a seed in one of GROUPS.
 
-    Raises InputError where the waypoints that were drawn make no path.
+    Raises InputError if the drawn waypoints do not define a path.
     """
     spec = DatasetSpec(count=10_000_000, seed=_SEED + list(GROUPS).index(group))
     chosen, mode, angle = row_limits(spec, seed)
@@ -102,7 +102,7 @@ GROUPS = MappingProxyType(
 
 
 def _outside(spec: DatasetSpec, seed: int, draw: Callable[[np.random.Generator], LimitSet]) -> LimitSet:
-    """Draw until a vehicle can hover and lies outside of every training draw's neighbourhood."""
+    """Draw until the vehicle can hover and the draw lies outside every neighbourhood."""
     random, around = generator(np.random.SeedSequence(spec.seed, spawn_key=(seed, 1))), _neighbourhoods()
     for _ in range(_TRIES):
         chosen = draw(random)

@@ -1,4 +1,4 @@
-"""Random min-snap paths by seeds, in named boxes whose low corner is the origin."""
+"""Random min-snap paths by seed, in named boxes whose lower corner is the origin."""
 
 import numpy as np
 
@@ -8,18 +8,18 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.safety.limit_sets import BOXES
 
-WAYPOINTS = (3, 6)  # fewest and most of a random path
-LENGTH_ERROR = 0.05
+WAYPOINTS = (3, 6)  # fewest and most waypoints of a random path
+LENGTH_ERROR = 0.05  # relative
 _ATTEMPTS = 1000
 
 
 def random_path(seed: int, box: str, waypoints: tuple[int, int] = WAYPOINTS) -> Path:
-    """Return the random path of that seed in one of the named boxes."""
+    """Return the random path of a seed in one of the named boxes."""
     return min_snap(random_waypoints(seed, np.stack([np.zeros(3), np.array(BOXES[box])]), waypoints))
 
 
 def path_of_length(length: float, box: str, seed: int) -> Path:
-    """Return a random path in the box of that length, m, to within LENGTH_ERROR. Raises InputError."""
+    """Return a random path in the box whose length, m, is within LENGTH_ERROR of `length`. Raises InputError."""
     size = np.array(BOXES[box])
     corners = np.stack([np.zeros(3), size])
     most = 3 + int(np.ceil(length / (0.3 * size.max())))

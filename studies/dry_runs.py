@@ -1,6 +1,6 @@
 """Fly the setpoints of each PATH in the dry run at several motor lags: largest deviation from the plan.
 
-Plans and setpoints are those for the vehicle of safety.yaml, whatever lag the simulated one has.
+Plans and setpoints are made for the vehicle of safety.yaml; only the simulated vehicle's lag varies.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ LAGS = (0.07, 0.105, 0.13)  # s, time constants of the motors
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown."""
+    """The paths to fly."""
 
     path_files: tuple[Path, ...] = argument()
 
@@ -41,7 +41,7 @@ COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path."""
+    """Return one case per path."""
     return Work({str(file): file for file in settings.path_files}, measure)
 
 
@@ -63,7 +63,7 @@ def measure(path_file: Path) -> dict[str, Any]:
 
 
 def tables(settings: Settings, rows: list[dict[str, Any]]) -> Iterator[Table]:
-    """Yield a line a path."""
+    """Yield a table with one row per path."""
     yield table("dry-runs", "Dry run: largest deviation by motor lag", COLUMNS, rows)
 
 

@@ -1,6 +1,6 @@
-"""Export each PATH for the vehicle's memory and fly it on board: deviations, beside the same plans streamed.
+"""Export each PATH for the vehicle's memory, fly it on board, and compare deviations with those of streaming the plan.
 
-Exports are flown in the dry run, flights by the pilot on the virtual Crazyflie of the stepped lab.
+Exports are flown in the dry run; the pilot flies on-board plans on the stepped lab's virtual Crazyflie.
 """
 
 import math
@@ -27,32 +27,32 @@ from studies.runner.study import Run, Study, Work
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown."""
+    """The paths to fly."""
 
     path_files: tuple[Path, ...] = argument()
 
 
 @dataclass(frozen=True, slots=True)
 class OnBoard:
-    """A path flown on board, in one of two ways, or why it is not."""
+    """A path flown on board in one of two ways, or the reason why it was not."""
 
     path: str
     what: str  # exports: in the dry run; on-board: in the stepped lab
-    reason: str = ""  # why it is not flown
-    kind: str = ""  # of the pieces
+    reason: str = ""  # why it was not flown; empty if it was
+    kind: str = ""  # of the pieces: raw or compressed
     pieces: int = 0
     bytes: int = 0
-    planned: float = math.nan  # s, the plan to which polynomials are fitted
-    duration: float = math.nan  # s, of what is flown
-    slowed: float = math.nan  # until polynomials keep the limits; relative
-    time_lost: float = math.nan  # for the fall, relative
+    planned: float = math.nan  # s, of the plan that the polynomials are fitted to
+    duration: float = math.nan  # s, of the flown motion
+    slowed: float = math.nan  # slow-down that makes the polynomials keep the limits, relative
+    time_lost: float = math.nan  # fraction of the time lost to keep a fall after link loss inside the walls
     on_board: float = math.nan  # m, largest deviation from the plan
-    streamed: float = math.nan  # m, that of the same plan, streamed
+    streamed: float = math.nan  # m, largest deviation of the same plan when streamed
     end: str = ""  # how the flight ended
 
     @property
     def difference(self) -> float:
-        """Return by how much it deviates more on board than streamed, m."""
+        """Return the deviation on board minus the deviation streamed, m."""
         return self.on_board - self.streamed
 
 
@@ -86,14 +86,14 @@ REFUSED_COLUMNS = (Column("path", "path"), Column("what", "what"), Column("reaso
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path."""
+    """Return one case per path."""
     return Work({str(file): file for file in settings.path_files}, measure, OnBoard)
 
 
 def measure(path_file: Path) -> list[OnBoard]:
-    """Export a path and fly it on board, and the same plans streamed.
+    """Export a path, fly it on board, and fly the same plans streamed.
 
-    What cannot be planned, fitted or prepared says why. Raises what reading the limits raises.
+    A failure to plan, fit or prepare becomes a row with its reason. Raises what reading the limits raises.
     """
     limits, rows = limits_for(path_file), []
     for what, fly in (("exports", _exported), ("on-board", _flown)):
@@ -139,7 +139,7 @@ def _fly(mission: Mission) -> tuple[float, str]:
 
 
 def tables(settings: Settings, rows: list[OnBoard]) -> Iterator[Table]:
-    """Yield what flew in the dry run, what flew in the stepped lab, and what did not fly."""
+    """Yield the dry runs, the flights in the stepped lab, and the paths that did not fly."""
     exported, flown = ([row for row in rows if row.what == what and not row.reason] for what in ("exports", "on-board"))
     yield table("exports", "Exports for the vehicle's memory, in the dry run", EXPORT_COLUMNS, exported)
     yield table("on-board", "Flights on board, in the stepped lab", FLIGHT_COLUMNS, flown)

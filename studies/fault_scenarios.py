@@ -1,4 +1,4 @@
-"""The faults of the fault table: what goes wrong, when, and which rung of the abort ladder it must lead to."""
+"""The scenarios of the fault table: faults, when they begin, and the rung of the abort ladder they must lead to."""
 
 from dataclasses import dataclass, field
 from math import pi
@@ -15,8 +15,8 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 
-FOR_GOOD = 60.0  # s, beyond the end of any flight of the table
-ASKED: Triple = (0.6, 2.0, 1.0)  # m, a waypoint that would be flown to if the planner were well
+FOR_GOOD = 60.0  # s, longer than any flight of the table
+ASKED: Triple = (0.6, 2.0, 1.0)  # m, a waypoint that a healthy planner could reach
 ASKED_AFTER = 0.8  # s after the stream began
 FULL_SPEED = 1.5  # s after the stream began: the path's cruise
 
@@ -26,31 +26,31 @@ class Scenario:
     """One flight of the fault table."""
 
     name: str
-    rung: Rung  # that it must lead to, and none below
-    faults: tuple[Fault, ...] = ()  # their starts count from the moment
-    phase: Phase = Phase.STREAM  # in which it begins
+    rung: Rung  # that it must lead to, and no lower one
+    faults: tuple[Fault, ...] = ()  # start times relative to `moment`
+    phase: Phase = Phase.STREAM  # in which the fault begins
     moment: float = FULL_SPEED  # s after the phase began
-    stall: float = 0.0  # s for which the pilot's computer stands still
-    stall_after: float = 0.0  # s from the moment
-    order: Order | None = None  # of the operator
+    stall: float = 0.0  # s for which the pilot's computer stalls
+    stall_after: float = 0.0  # s after `moment`
+    order: Order | None = None  # operator command at `moment`
     main_killed: bool = False
-    main_killed_after: float = 0.0  # s from the moment
+    main_killed_after: float = 0.0  # s after `moment`
     pilot_killed: bool = False
-    pilot_killed_after: float = 0.0  # s from the moment
+    pilot_killed_after: float = 0.0  # s after `moment`
     disk_full: bool = False
     planner: PlannerFault | None = None
-    """What is wrong with the planner in flight, which is asked for ASKED at that moment."""
-    from_start: bool = False  # the faults are there before anything is connected
+    """Fault of the in-flight planner, which is asked to fly to ASKED at `moment`."""
+    from_start: bool = False  # the faults are active before the pilot connects
     vehicle: VehicleSettings = field(default_factory=lambda: VehicleSettings(auto_arming=False))
-    """Armed by request alone, so that a test can see whether it was disarmed."""
-    cameras: ViconSettings | None = None  # None: those of the lab
+    """Arms only on request, so that a test can see whether the vehicle was disarmed."""
+    cameras: ViconSettings | None = None  # None: the lab's defaults
     falls: bool = False
-    """Motors stop in the air: the vehicle's supervisor stops them, or a take-off ends a hand above the floor."""
-    grounded: bool = False  # it must never take off
+    """Motors stop in the air: the vehicle's supervisor stops them, or a take-off ends just above the floor."""
+    grounded: bool = False  # the vehicle must never take off
 
     @property
     def leaves_alone(self) -> bool:
-        """Return whether nobody can end the flight: the pilot or the radio dies for good."""
+        """Return whether the vehicle is left to its own time-outs: the pilot or the radio dies for good."""
         deaths = (RadioFaultKind.DEAD, RadioFaultKind.UNACKNOWLEDGED)
         dead = (fault.kind in deaths and fault.duration >= FOR_GOOD for fault in self.faults)
         return self.pilot_killed or any(dead)
@@ -69,7 +69,7 @@ def _vehicle(name: str, kind: VehicleFaultKind, rung: Rung, duration: float, **c
 
 
 def _odd(name: str, *, grounded: bool = False, **settings: Any) -> Scenario:
-    """Return the scenario of a vehicle that is not as it should be."""
+    """Return a scenario with unusual vehicle settings."""
     return Scenario(name, Rung.NONE, vehicle=VehicleSettings(auto_arming=False, **settings), grounded=grounded)
 
 

@@ -1,4 +1,4 @@
-"""Fly along PATH with one fault a flight, at full speed, and judge by the simulated truth what the pilot does about it.
+"""Fly along PATH at full speed with one fault per flight, and judge the pilot's reaction by the simulated truth.
 
 In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose gate, the virtual Crazyflie
 and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
@@ -67,23 +67,23 @@ COLUMNS = (
     Column("why", "why", value=lambda rows: rows[0].planner if rows[0].reason == "landed" else rows[0].reason),
 )  # fmt: skip
 _DOWN = 0.05  # m
-_SETTLING = 0.1  # s in which the supervisor notices that it was disarmed
-_AFTERWARDS = 6.0  # s after the pilot ended, in which the vehicle comes to rest
-_LONGEST = 100.0  # s; a vehicle that is left alone on the floor disarms 30 s after it was armed
+_SETTLING = 0.1  # s until the supervisor reports that the vehicle was disarmed
+_AFTERWARDS = 6.0  # s that the vehicle gets to come to rest after the pilot ended
+_LONGEST = 100.0  # s; a vehicle that is left to itself on the floor disarms 30 s after arming
 _ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
-_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)  # begin the events that name one
+_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)  # an event that names a rung begins with one of these
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which faults are flown, and where."""
+    """The faults to fly, and the path."""
 
     path_file: Path = argument()
     only: tuple[str, ...] = option((), "Faults whose name contains this text.")
 
 
 class PilotKilled(BaseException):
-    """The pilot's process ends at once."""
+    """Simulates the sudden death of the pilot's process."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +94,8 @@ class FaultFlight:
     phase: str  # in which the fault begins
     expected: str
     rung: str
-    reaction: float | None  # s from the fault to the rung; None where there was none
-    off_plan: float  # m, largest distance of the true position from the planned path, from landing on horizontally
+    reaction: float | None  # s from the fault to the first rung; None if the pilot took none
+    off_plan: float  # m, largest distance of the true position from the planned path; horizontal once landing begins
     off_setpoint: float  # m, largest distance of the true position from the setpoint, until landing begins
     to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
     highest: float  # m above the floor
@@ -103,21 +103,21 @@ class FaultFlight:
     motors_off: int  # ms with all motors off in the air
     landed: bool  # on the floor, motors off
     disarmed: bool
-    locked: bool  # by its supervisor, at any time
-    readable: bool  # what was recorded can be read
+    locked: bool  # the supervisor locked at some time
+    readable: bool  # the record can be read
     reason: str
-    planner: str  # its answer; empty where it was asked nothing or did not answer
-    seed: int = 0  # of the random faults
-    path: str = ""  # of several
+    planner: str  # its answer; empty if it was not asked or did not answer
+    seed: int = 0  # of the flight's random faults
+    path: str = ""  # set where a study flies several paths
 
     @property
     def bad(self) -> bool:
-        """Return whether it was outside the walls, not landed, not disarmed, or left no readable record."""
+        """Return whether the vehicle left the walls, did not land or disarm, or left no readable record."""
         return not (self.to_wall > 0.0 and self.landed and self.disarmed and self.readable)
 
     @property
     def end(self) -> str:
-        """Return how it ended, in words."""
+        """Return how the flight ended, in words."""
         ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
         without = f", {self.motors_off} ms without motors" if self.motors_off else ""
         return (", ".join(ends) or "in the air") + without
@@ -125,22 +125,22 @@ class FaultFlight:
 
 @dataclass(slots=True)
 class SteppedFlight:
-    """What a flight in the stepped lab left behind."""
+    """The outcome of a flight in the stepped lab, with its truth and messages."""
 
     outcome: FlightOutcome | None  # None where the pilot was killed, or never flew
     reason: str
     truth: Truth
-    struck: float  # s, when the fault began; NaN where it was there from the start, or never began
+    struck: float  # s, when the fault began; NaN if it was active from the start or never began
     events: list[tuple[float, str]] = field(default_factory=list)
-    answers: list[PathAnswer] = field(default_factory=list)  # of the planner
-    sent: list[tuple[float, Triple]] = field(default_factory=list)  # s, m, each setpoint from the plan's first on
+    answers: list[PathAnswer] = field(default_factory=list)  # the planner's
+    sent: list[tuple[float, Triple]] = field(default_factory=list)  # (s, m) of each setpoint of the plan
     landing: float = math.inf  # s, when the last phase of landing began
-    killed: bool = False  # the pilot, in flight or before
-    ended: bool = False  # the pilot, whatever it ended by
+    killed: bool = False  # the pilot was killed, in flight or before
+    ended: bool = False  # the pilot returned or raised
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a fault; all fly the same mission. Raises what preparing raises."""
+    """Return one case per fault; all fly the same mission. Raises what preparing raises."""
     limits = limits_for(settings.path_file)
     mission, held = prepare_mission(settings.path_file, limits), prepare_held(settings.path_file, limits)
     wanted = [row for row in SCENARIOS if not settings.only or any(text in row.name for text in settings.only)]
@@ -149,17 +149,17 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
-    """Yield a line a fault."""
+    """Yield a table with one row per fault."""
     yield table("faults", "Faults at full speed", COLUMNS, rows)
 
 
 def prepare_held(source: Path, limits: Limits) -> HeldFlight:
-    """Return the flight along a path file as a planner holds it. Raises what planning raises."""
+    """Plan a path file and return the flight as the in-flight planner holds it. Raises what planning raises."""
     return hold(plan_flight(source, limits).plan, load_path_file(source).waypoints)
 
 
 def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0, *, held: HeldFlight | None = None) -> FaultFlight:
-    """Fly one, with a record, and judge it by the truth. A fault of the planner needs what is held."""
+    """Fly a scenario, record it, and judge it by the truth. A planner fault needs `held`."""
     if scenario.planner is not None:
         if held is None:
             raise InputError(
@@ -193,7 +193,7 @@ def fly_stepped(
     lab: SteppedLab | None = None,
     held: HeldFlight | None = None,
 ) -> SteppedFlight:
-    """Fly one in a stepped lab, by default a new one with that seed, until everything has come to rest."""
+    """Fly a scenario in a stepped lab, by default a new one with this seed, until everything has come to rest."""
     lab = lab or _lab(scenario, mission, seed)
     orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
     planner = None
@@ -219,7 +219,7 @@ def fly_stepped(
         if flown.ended:
             return
         flown.killed = True
-        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # what is left of the pilot's code cannot disarm any more
+        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # the pilot's cleanup code must not reach the vehicle
         raise PilotKilled
 
     def hear(message: Telemetry) -> None:
@@ -272,7 +272,7 @@ def _lab(scenario: Scenario, mission: Mission, seed: int) -> SteppedLab:
 
 
 def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:
-    """Judge a flight by the truth."""
+    """Return the verdict on a flight, by the simulated truth."""
     truth, outcome = flown.truth, flown.outcome
     rung = outcome.rung if outcome is not None else Rung.NONE
     rungs = (time for time, text in flown.events if time >= flown.struck and text.startswith(_RUNGS))
@@ -304,7 +304,7 @@ def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: 
 def to_wall(truth: Truth, space: Space) -> float:
     """Return the least distance, m, of the true position from walls and ceiling; negative beyond them."""
     low, high = np.array(space.low), np.array(space.high)
-    low[2] = -np.inf  # the floor is where it lands
+    low[2] = -np.inf  # the vehicle may touch the floor
     return float(np.minimum(truth.position - low, high - truth.position).min())
 
 
@@ -330,7 +330,7 @@ def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
 
 
 def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
-    """Return the largest distance in time: a vehicle that is late on its path is off its setpoint."""
+    """Return the largest distance, m, from the setpoint of the same moment: lagging along the path counts."""
     if not flown.sent:
         return 0.0
     sent, truth = np.array([time for time, _ in flown.sent]), flown.truth

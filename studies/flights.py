@@ -1,6 +1,6 @@
-"""Fly every PATH on the virtual Crazyflie in real time, one flight after the other, each with other noise.
+"""Fly every PATH on the virtual Crazyflie in real time, one flight after another, each with a different noise seed.
 
-Measures how far the vehicle is off its plan, by the poses and by the simulated truth, and how late setpoints are.
+Measures the deviation from the plan, by the poses and by the simulated truth, and how late setpoints are sent.
 """
 
 import math
@@ -84,7 +84,7 @@ FAILURE_COLUMNS = (Column("path", "path"), Column("seed", "seed"), Column("reaso
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is flown, how often, and what the lab is like."""
+    """Paths, repeats and conditions of the lab."""
 
     path_files: tuple[Path, ...] = argument()
     repeats: int = option(1, "Flights of each path.", least=1)
@@ -96,7 +96,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class JudgedFlight:
-    """One flight with its plan, or why there was none; NaN: was not measured."""
+    """One flight with its plan, or the reason why there was none; NaN where nothing was measured."""
 
     path: str
     seed: int
@@ -106,33 +106,33 @@ class JudgedFlight:
     planner: str = ""
     planned: float = math.nan  # s
     lower_bound: float = math.nan  # s
-    speed_factor: float = math.nan  # of repair, on the planner's speed; 1: not slowed
-    worst_usage: float = math.nan  # of a limit, by the certificate
+    speed_factor: float = math.nan  # of repair, on the planner's speed; 1: not slowed down
+    worst_usage: float = math.nan  # largest usage of any limit, by the certificate
     dry_run: float = math.nan  # m, largest deviation
-    dry_run_without_drag: float = math.nan  # m, the same where the acceleration field does not make up for drag
+    dry_run_without_drag: float = math.nan  # m, the same without drag compensation in the acceleration field
     motor_lag: float = math.nan  # s, the plan's
-    refusals: int = 0  # tries before it that preflight refused because this computer was late
-    streamed: float = math.nan  # s, from the first setpoint to that of the path's end, as sent
+    refusals: int = 0  # earlier attempts that preflight refused only because this computer was late
+    streamed: float = math.nan  # s, from sending the first setpoint to sending that of the path's end
     deviation_max: float = math.nan  # m, from the reference in time, by the poses of motion capture
     deviation_rms: float = math.nan  # m
     true_deviation_max: float = math.nan  # m, by the simulated truth
-    settled_after: float = math.nan  # s; not finite where it did not settle
+    settled_after: float = math.nan  # s; not finite if it did not settle
     late_p99: float = math.nan  # s, of setpoints
     late_max: float = math.nan  # s
 
     @property
     def over_bound(self) -> float:
-        """Return by how much the plan takes longer than the lower bound, relative."""
+        """Return the planned time over the lower bound, as a relative excess."""
         return self.planned / self.lower_bound - 1
 
     @property
     def off_plan(self) -> float:
-        """Return by how much the time from the first setpoint to the last differed from the plan, relative."""
+        """Return the relative difference between streamed and planned time."""
         return abs(self.streamed / self.planned - 1)
 
 
 class Prepared(NamedTuple):
-    """One path, ready to be flown, or a row that says why it is not."""
+    """One path ready to be flown, or a row with the reason why it is not."""
 
     row: JudgedFlight
     mission: Mission | None = None
@@ -140,9 +140,9 @@ class Prepared(NamedTuple):
 
 
 def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = fly_in_real_time) -> Work:
-    """Return a case a flight: each path `repeats` times, with a seed for each. A failure is a row.
+    """Return one case per flight: each path `repeats` times, each with its own seed. A failure is a row.
 
-    Raises InputError, before anything is planned, where a file is no path or conditions make no sense.
+    Raises InputError, before anything is planned, if a file is not a path file or a condition is out of range.
     """
     lab = Conditions(settings.loss, settings.pose_noise, settings.vicon, settings.seed)
     for file in settings.path_files:
@@ -160,14 +160,14 @@ def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = f
             return row
         flight = fly(mission, replace(lab, seed=seed), name=row.path)
         if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
-            raise KeyboardInterrupt  # who ends the flight ends the study
+            raise KeyboardInterrupt  # the operator's stop ends the study too
         return _judged(replace(row, seed=seed), trajectory, flight)
 
     return Work(cases, measure, JudgedFlight)
 
 
 def tables(settings: Settings, rows: list[JudgedFlight]) -> Iterator[Table]:
-    """Yield the plans, the flights by path and all together, and those that failed where there are any."""
+    """Yield the plans, the flights by path and in total, and the failed flights if there are any."""
     planned, failed = [row for row in rows if row.planner], [row for row in rows if not row.landed]
     lag = planned[-1].motor_lag if planned else math.nan
     title = (
@@ -211,7 +211,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
 
 
 def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
-    """Return the same flight with the acceleration of the motion alone, and the attitude that leans for just that."""
+    """Return the same flight with accelerations and attitudes of the motion alone, without drag compensation."""
     times = encoded.times + encoded.lead
     states = trajectory.at(times)
     thrust = states.acceleration + np.array([0.0, 0.0, GRAVITY])

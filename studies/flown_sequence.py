@@ -1,8 +1,8 @@
-"""Judge what a steered flight streamed, from its first setpoint to its last, against the limits of plans and of stops.
+"""Judge the setpoints of a steered flight, from the first to the last, against the limits of plans and of stops.
 
-Nothing that planner or pilot computed is believed: the bytes that the pilot says it is bound to are laid together to
-one sequence, what was sent is compared with it, and that sequence is held against the motions that were committed, and
-against what its own velocities and positions say by differences.
+Results of planner and pilot are not trusted: the committed bytes, as the pilot reports them, are joined into one
+sequence. What was sent is compared with that sequence, and the sequence is compared with the committed motions and with
+finite differences of its own velocities.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,46 +33,46 @@ from cfplan.safety.space import inside
 from cfplan.vehicle.joint import JoinedTrajectory
 
 _FIELDS = ("position", "velocity", "acceleration", "body_rate")
-_SPAN = 2  # setpoints on each side, over which velocities are differentiated
-_ROUNDED = np.sqrt(3.0) * 2.0 * HALF_QUANTUM * RATE / (2.0 * _SPAN)  # m/s², by which such a difference is off
+_SPAN = 2  # setpoints on each side in a central difference of velocity
+_ROUNDED = np.sqrt(3.0) * 2.0 * HALF_QUANTUM * RATE / (2.0 * _SPAN)  # m/s², its largest rounding error
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Committed:
-    """One plan or stop that the pilot accepted, or what the flight began with."""
+    """One plan or stop that the pilot accepted, or the plan that the flight began with."""
 
     splice: int  # number of its first setpoint
     payloads: NDArray  # (K, 29) uint8
-    stops: NDArray  # (K, 2, 29) uint8, the first and the last setpoint of the stop from each
-    flown: JoinedTrajectory  # all motion of the flight with it, on a clock that is 0 at setpoint 0
-    stop_from: int = 0  # number of the first setpoint of the stop at its end, or that it is; 0 where there is none
-    stop_until: int = 0  # number of the setpoint at which that rests
-    later: int = 0  # setpoints, by which all of it is flown later than proposed
+    stops: NDArray  # (K, 2, 29) uint8, first and last setpoint of the stop that begins at each
+    flown: JoinedTrajectory  # all motion of the flight including it; its clock is 0 at setpoint 0
+    stop_from: int = 0  # number of the first setpoint of the stop at its end, or of the stop itself; 0: none
+    stop_until: int = 0  # number of the setpoint at which that stop is at rest
+    later: int = 0  # setpoints by which all of it is delayed against its proposal
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceVerdict:
-    """The worst of a flown sequence."""
+    """The worst values of a flown sequence."""
 
-    setpoints: int  # that were sent
-    missing: int  # between the first and the last, that were not sent, of those that move
-    differing: int  # from those that were committed
-    plan_usage: float  # of a limit, the most that the dense certificate finds in a committed plan
+    setpoints: int  # number sent
+    missing: int  # moving setpoints between the first and the last that were not sent
+    differing: int  # setpoints sent that differ from those committed
+    plan_usage: float  # largest usage of any limit in a committed plan, by the dense certificate
     speed: float  # m/s
-    acceleration: float  # m/s², by differences of velocity outside stops, less what packets round
+    acceleration: float  # m/s², by differences of velocity outside stops, less the rounding in packets
     stop_acceleration: float  # m/s², likewise in stops
-    joint: float  # quanta, the most that a field jumps by at a splice
-    without_stop: int  # setpoints that were sent without a committed stop that begins there and rests inside
-    faults: tuple[str, ...]  # what exceeds a limit, in words
+    joint: float  # quanta, largest jump of any field at a splice
+    without_stop: int  # setpoints sent without a committed stop that begins there and ends at rest inside
+    faults: tuple[str, ...]  # the exceeded limits, in words
 
 
 def judge_sequence(
     sent: Mapping[int, SetpointSent], commitments: Sequence[Committed], limits: Limits
 ) -> SequenceVerdict:
-    """Judge setpoints as they were sent, by their numbers; `commitments` in order, the first begins the flight."""
+    """Return the verdict on the setpoints sent, by their numbers; the first of `commitments` begins the flight."""
     sequence, stops, joint = _laid_together(commitments)
     numbers = np.array(sorted(sent), dtype=int)
-    rows = np.minimum(numbers, len(sequence) - 1)  # after its end the vehicle hovers
+    rows = np.minimum(numbers, len(sequence) - 1)  # the vehicle hovers after the end of the sequence
     flown, planned = _of_messages([sent[number] for number in numbers]), _rows(decode(sequence), rows)
     off = np.max([np.abs(getattr(flown, name) - getattr(planned, name)).max(axis=1) for name in _FIELDS], axis=0)
     in_stop = np.zeros(len(sequence), dtype=bool)
@@ -99,7 +99,7 @@ def judge_sequence(
 
 
 def _missing(sequence: NDArray, numbers: NDArray) -> int:
-    """Return how many moving setpoints were left out; where it waits at the end, the pilot repeats the last."""
+    """Return the number of moving setpoints not sent; setpoints at rest do not count, as the pilot repeats the last."""
     moving = np.array(decode(sequence).velocity.any(axis=1))
     moving[numbers[numbers < len(moving)]] = False
     return int(moving[numbers[0] : numbers[-1]].sum())
@@ -120,10 +120,10 @@ def _exceeded(verdict: SequenceVerdict, limits: Limits) -> list[str]:
 
 
 def _laid_together(commitments: Sequence[Committed]) -> tuple[NDArray, NDArray, float]:
-    """Return all setpoints (N, 29) as they were committed last, their stops, and the largest jump at a splice."""
+    """Return the last committed version of all setpoints, (N, 29), their stops, and the largest jump at a splice."""
     sequence, stops, worst = commitments[0].payloads, commitments[0].stops, 0.0
     for each in commitments[1:]:
-        waits = max(each.splice - len(sequence) + 1, 0)  # it hovers at the end of what was held
+        waits = max(each.splice - len(sequence) + 1, 0)  # hovers at the end of the previous commitment
         sequence = np.concatenate([sequence, np.repeat(sequence[-1:], waits, axis=0)])
         stops = np.concatenate([stops, np.repeat(stops[-1:], waits, axis=0)])
         worst = max(worst, _jump(sequence[each.splice], each.payloads[0]))
@@ -133,7 +133,7 @@ def _laid_together(commitments: Sequence[Committed]) -> tuple[NDArray, NDArray, 
 
 
 def _jump(before: NDArray, after: NDArray) -> float:
-    """Return by how many quanta two setpoints, (29,), differ; those of attitude are what its bits may be off by."""
+    """Return the largest difference of two setpoints, (29,), in quanta; attitude counts in its own rounding error."""
     both = decode(np.stack([before, after]))
     fields = max(float(np.abs(np.subtract(*getattr(both, name))).max()) for name in _FIELDS) / QUANTUM
     turned = 2.0 * np.arccos(min(abs(float(both.quaternion[0] @ both.quaternion[1])), 1.0))
@@ -141,16 +141,16 @@ def _jump(before: NDArray, after: NDArray) -> float:
 
 
 def _plan_usage(commitments: Sequence[Committed], limits: Limits) -> float:
-    """Return the largest usage of a limit that the dense certificate finds in any motion that was committed."""
+    """Return the largest usage of any limit in any committed motion, by the dense certificate."""
     trajectories = {id(each): each for committed in commitments for each in committed.flown.trajectories}
     return max(certify(each, limits.plan, limits.space).worst.share for each in trajectories.values())
 
 
 def _byte_faults(committed: Committed, limits: Limits) -> list[str]:
-    """Return what the check of bytes finds in the setpoints of a plan or a part of it, before the stop behind that."""
+    """Return the faults that the byte check finds in a plan's setpoints, without those of the stop at its end."""
     before_stop = committed.stop_from - committed.splice if committed.stop_from else len(committed.payloads)
     if before_stop <= 0:
-        return []  # it is a stop
+        return []  # the commitment is a stop
     payloads = committed.payloads[:before_stop]
     times, since, decoded = (
         np.arange(before_stop) / RATE,
@@ -178,7 +178,7 @@ def _without_stop(flown: FullStateSetpoints, stops: NDArray, limits: Limits) -> 
 
 
 def _differentiated(velocity: NDArray, numbers: NDArray) -> NDArray:
-    """Return (N,) m/s²: the change of velocity about each setpoint, less what packets round, at least 0."""
+    """Return (N,) m/s²: the rate of change of velocity at each setpoint, less the rounding in packets, at least 0."""
     out = np.zeros(len(numbers))
     ahead, behind = np.arange(2 * _SPAN, len(numbers)), np.arange(len(numbers) - 2 * _SPAN)
     change = np.linalg.norm(velocity[ahead] - velocity[behind], axis=1) * RATE / (numbers[ahead] - numbers[behind])

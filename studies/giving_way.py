@@ -1,8 +1,8 @@
-"""Simulate link loss at every setpoint along each PATH and random paths, before and after plans give way.
+"""Simulate link loss at every setpoint of each PATH and of random paths, before and after plans give way.
 
-Each path is planned at the full speed that the limits allow. For every setpoint and several motor lags it is simulated
-where the vehicle comes down if that is the last one: with body rates sent as they are planned, with rates sent as turns
-of the attitude, and after the plan has given way. The second and the third differ only where plans give way.
+Each path is planned at the full speed that the limits allow. For every setpoint and several motor lags, the study
+simulates where the vehicle comes down if no setpoint follows: with body rates sent as planned, with body rates traded
+for turns of the attitude, and after the plan has given way. The last two differ only for plans that give way.
 """
 
 from collections.abc import Iterator
@@ -39,36 +39,36 @@ from studies.runner.reductions import among, count, largest, quantile
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-WALL_DISTANCE = 0.05  # m beyond the margin, that random waypoints keep; paths swing out between them
+WALL_DISTANCE = 0.05  # m that random waypoints keep from the margin, as paths swing out between them
 RANDOM = "random paths"
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown."""
+    """The paths to fly."""
 
     path_files: tuple[FilePath, ...] = argument()
-    random: int = option(200, "Random paths besides.", least=0)
-    seed: int = option(0, "Of the first random path.", least=0)
+    random: int = option(200, "Number of additional random paths.", least=0)
+    seed: int = option(0, "Seed of the first random path.", least=0)
 
 
 @dataclass(frozen=True, slots=True)
 class SlowedFlight:
-    """One path: how far beyond the walls the vehicle comes down, from the worst setpoint and lag; negative inside."""
+    """One path: how far beyond the walls the vehicle comes down, for the worst setpoint and lag; negative inside."""
 
     path: str  # its name, or RANDOM
     flight: str
     duration: float  # s, before giving way
-    lost: float  # fraction of the time, lost by giving way
-    refused: str  # why it is not flown
+    lost: float  # fraction of the time lost by giving way
+    refused: str  # why it is not flown; empty if it is
     reasons: str  # for giving way
-    rates_beyond: float  # m, with rates as planned
-    before_beyond: float  # m, with rates as turns
+    rates_beyond: float  # m, with body rates sent as planned
+    before_beyond: float  # m, with body rates sent as turns of the attitude
     after_beyond: float  # m, after giving way
 
     @property
     def flown(self) -> bool:
-        """Return whether it is flown."""
+        """Return whether the flight was accepted."""
         return not self.refused
 
 
@@ -93,7 +93,7 @@ COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path: the line of the table, its name, path and yaw. Raises what reading a path file raises."""
+    """Return one case per path: its table row, name, path and yaw. Raises what reading a path file raises."""
     limits = limits_for(settings.path_files[0])
     files = [load_path_file(file) for file in settings.path_files]
     cases = [(each.name, each.name, each.path, each.yaw, each.yaw_angle) for each in files]
@@ -103,7 +103,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def random_paths(limits: Limits, first_seed: int, number: int) -> list[tuple[int, Path]]:
-    """Return random paths, with their seeds, that stay within the space and its margin."""
+    """Return `number` random paths that keep the margin to the walls, with their seeds."""
     return list(islice(_within(limits.space, first_seed), number))
 
 
@@ -111,14 +111,14 @@ def _within(space: Space, first_seed: int) -> Iterator[tuple[int, Path]]:
     distance = space.margin + WALL_DISTANCE
     box = np.array([space.low, space.high]) + np.array([[distance], [-distance]])
     for seed in count_from(first_seed):
-        with suppress(CfplanError):  # between its waypoints it leaves the space, or has a cusp
+        with suppress(CfplanError):  # the path leaves the space between its waypoints, or has a cusp
             path = min_snap(random_waypoints(seed, box, WAYPOINTS))
             check_space(path, space)
             yield seed, path
 
 
 def measure(case: tuple[str, str, Path, YawMode, float], limits: Limits) -> SlowedFlight:
-    """Lose the link at every setpoint of a path. Raises what planning it raises."""
+    """Simulate link loss at every setpoint of a path. Raises what planning it raises."""
     line, name, path, yaw, yaw_angle = case
     planned = plan(path, limits.airframe, limits, yaw=yaw, yaw_angle=yaw_angle)
     before, slowed, refused = _encoded(planned, limits), planned, ""
@@ -141,13 +141,13 @@ def _encoded(planned: Plan, limits: Limits) -> EncodedFlight:
 
 
 def _beyond(payloads: NDArray, limits: Limits) -> float:
-    """Return how far beyond the walls the vehicle comes down, m, from the worst setpoint and lag."""
+    """Return the distance beyond the walls where the vehicle comes down, m, for the worst setpoint and lag."""
     with_lags = replace(limits, link_loss=replace(limits.link_loss, motor_lags=LAGS))
     return float(link_loss_at_every_setpoint(payloads, with_lags).beyond.max())
 
 
 def tables(settings: Settings, rows: list[SlowedFlight]) -> Iterator[Table]:
-    """Yield a line for each path file, and one for all random paths."""
+    """Yield a table with one row per path file and one for all random paths."""
     title = f"Link loss at every setpoint, motor lags of {', '.join(f'{lag:g}' for lag in LAGS)} s"
     yield table("giving-way", title, COLUMNS, rows, by=("path",))
 

@@ -1,7 +1,8 @@
-"""Plan along random waypoints of which only the next few are known, and compare with knowing all: time lost.
+"""Plan along random waypoints with only the next few known, and measure the time lost against knowing all of them.
 
-Whenever a waypoint is passed another one is told, and the plan goes on through it from a joint there, as requests in
-flight do. It always ends at rest at the last waypoint known. The whole path is the one that is planned before take-off.
+Each time a waypoint is passed, the next one is revealed and the plan is continued through it from a joint near the
+passed one, as requests in flight do. A plan always ends at rest at the last known waypoint. The reference is the plan
+through all waypoints, made before take-off.
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,30 +26,30 @@ from studies.runner.reductions import count, largest, quantile, total
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-LATER = (0.0, 0.15, 0.35)  # s after a waypoint, at which the plan is continued: where it cannot be at once, later
-WALL_DISTANCE = 0.3  # m beyond the margin, that random waypoints keep
-ROOM = 5.0  # m by which the walls are moved outwards: what is compared are times, not whether curves swing too far out
+JOINT_DELAYS = (0.0, 0.15, 0.35)  # s from a waypoint to the joint; the first that allows a continuation is taken
+WALL_DISTANCE = 0.3  # m that random waypoints keep from the margin
+ROOM = 5.0  # m by which the walls are moved out, so that only times are compared, not how far curves swing out
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are planned."""
+    """The paths to plan."""
 
     paths: int = option(100, "Random paths.", least=1)
-    seed: int = option(0, "Of the first path.", least=0)
-    waypoints: int = option(20, "Of each path.", least=3)
-    known: tuple[int, ...] = option((3,), "Waypoints ahead that are known.", least=1)
+    seed: int = option(0, "Seed of the first path.", least=0)
+    waypoints: int = option(20, "Waypoints of each path.", least=3)
+    known: tuple[int, ...] = option((3,), "Number of known waypoints ahead.", least=1)
 
 
 @dataclass(frozen=True, slots=True)
 class ShortSighted:
-    """One path, planned with few of its waypoints known."""
+    """One path, planned with only some of its waypoints known."""
 
     seed: int
     known: int
     complete: float  # s, knowing all waypoints
     duration: float  # s, knowing some
-    stops: int  # between
+    stops: int  # before the last waypoint
 
     @property
     def lost(self) -> float:
@@ -82,7 +83,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def measure(case: tuple[int, int], waypoints: int, limits: Limits) -> ShortSighted:
-    """Plan the path of a seed knowing some of its waypoints. Raises a CfplanError where it cannot be planned."""
+    """Plan the path of a seed with some of its waypoints known. Raises a CfplanError if it cannot be planned."""
     seed, known = case
     space = limits.space
     away = space.margin + WALL_DISTANCE
@@ -94,17 +95,17 @@ def measure(case: tuple[int, int], waypoints: int, limits: Limits) -> ShortSight
 
 
 def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int]:
-    """Return how long, s, a flight from the first of the points, (N, 3) m, through all others takes, and its stops.
+    """Return the duration, s, and the number of stops of a flight through all of the points, (N, 3) m.
 
-    `known` are the waypoints ahead that are known, at least 1; of those at which it stops without need it knows as
-    many. Raises a CfplanError where not even a plan from rest leads through them.
+    `known` is the number of waypoints ahead that are known, at least 1. Where no plan can be continued, the vehicle
+    comes to rest and starts again with as many. Raises a CfplanError if not even a plan from rest leads through them.
     """
     trajectory, reached = _from_rest(points[: known + 1], limits)
-    ahead, told = points[1 : known + 1], points[known + 1 :]
+    ahead, hidden = points[1 : known + 1], points[known + 1 :]
     elapsed, stops = 0.0, 0
-    while len(told):
+    while len(hidden):
         passed = float(trajectory.time_at(reached[0]))
-        for later in LATER:
+        for later in JOINT_DELAYS:
             if passed + later >= trajectory.duration:
                 continue
             s = float(trajectory.s_at(passed + later))
@@ -114,7 +115,7 @@ def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int
                 for number, (point, at) in enumerate(zip(ahead, reached, strict=True))
                 if at > s and np.linalg.norm(point - here) >= MIN_SPACING
             ]
-            new = told[: max(known - len(kept), 1)]
+            new = hidden[: max(known - len(kept), 1)]
             through = np.concatenate([ahead[kept].reshape(-1, 3), new])
             begin = through[len(kept) - 1] if kept else here
             onwards = centripetal_times(np.concatenate([begin[None], new]))
@@ -124,25 +125,25 @@ def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int
             except NoWayError:
                 continue
             elapsed += passed + later
-            trajectory, reached, ahead, told = made.plan.trajectory, made.reached, through, told[len(new) :]
+            trajectory, reached, ahead, hidden = made.plan.trajectory, made.reached, through, hidden[len(new) :]
             break
         else:
             elapsed, stops = elapsed + trajectory.duration, stops + 1
-            from_rest = np.concatenate([ahead[-1:], told[:known]])
+            from_rest = np.concatenate([ahead[-1:], hidden[:known]])
             trajectory, reached = _from_rest(from_rest, limits)
-            ahead, told = from_rest[1:], told[known:]
+            ahead, hidden = from_rest[1:], hidden[known:]
     return elapsed + trajectory.duration, stops
 
 
 def _from_rest(points: NDArray, limits: Limits) -> tuple[Trajectory, tuple[float, ...]]:
-    """Return the plan from the first of the points through the others, and the s of each of those."""
+    """Return the plan from rest at the first point through the others, and the path parameter s of each of those."""
     times = centripetal_times(points)
     planned = plan(min_snap(points, times=times), limits.airframe, limits, planner="expert")
     return planned.trajectory, tuple(np.cumsum(times).tolist())
 
 
 def tables(settings: Settings, rows: list[ShortSighted]) -> Iterator[Table]:
-    """Yield a line for each number of known waypoints."""
+    """Yield a table with one row per number of known waypoints."""
     title = f"Time lost by knowing only the next waypoints of {settings.waypoints}"
     yield table("horizon", title, COLUMNS, rows, by=("known",))
 

@@ -1,8 +1,8 @@
-"""Identify drawn vehicles from one flight along PATH each in the stepped lab, and fly NEXT with what was found.
+"""Identify random vehicles from one flight along PATH each in the stepped lab, and fly NEXT with the results.
 
-Mass, motor lag, drag, thrust and the poses' latency are drawn by seeds. Each vehicle flies PATH as if it were the one
-of safety.yaml; its record, read back from its file, is all that identification sees. Then every vehicle flies NEXT four
-times: as unknown as before, as identified, as identified without having been weighed, and as if all were known.
+Mass, motor lag, drag, thrust and pose latency are drawn by seed. Each vehicle flies PATH as if it were the one of
+safety.yaml; identification sees only its record, read back from the file. Then every vehicle flies NEXT four times:
+with the parameters of safety.yaml, as identified, as identified without having been weighed, and with its true ones.
 """
 
 import math
@@ -39,25 +39,25 @@ from studies.runner.reductions import count, largest, median
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-MASS, THRUST = 0.10, 0.08  # by which they are off at most, relative
+MASS, THRUST = 0.10, 0.08  # largest relative deviation from the nominal values
 LAGS, DRAGS, LATENCIES = (0.06, 0.14), (0.5, 2.0), (0.005, 0.040)  # s, factor, s
-SCALE_STEP = 1e-4  # kg, of the scale that weighs the vehicle
+SCALE_STEP = 1e-4  # kg, resolution of the scale that weighs the vehicle
 _FIRST_SEED = 1000
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown, and by how many vehicles."""
+    """The paths to fly, and the number of vehicles."""
 
     path_file: Path = argument()
     next_file: Path = argument()
-    vehicles: int = option(30, "Drawn by seeds.", least=1)
-    seed: int = option(0, "Of the first vehicle.", least=0)
+    vehicles: int = option(30, "Number of vehicles.", least=1)
+    seed: int = option(0, "Seed of the first vehicle.", least=0)
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnVehicle:
-    """A vehicle that differs from what its lab believes."""
+    """A vehicle whose true parameters differ from the nominal ones."""
 
     seed: int
     airframe: Airframe
@@ -66,14 +66,14 @@ class DrawnVehicle:
 
 @dataclass(frozen=True, slots=True)
 class StudiedVehicle:
-    """What was found of a vehicle, and how it flew; NaN where it did not."""
+    """Identification errors of one vehicle, and the deviations of its flights; NaN for flights that failed."""
 
     seed: int
-    first_flight: str  # how it ended
-    reason: str = ""  # why there is nothing
+    first_flight: str  # how that flight ended
+    reason: str = ""  # why there is no identification; empty if there is
     errors: dict[str, float] = field(default_factory=dict)  # by the keys of _ASKED, in the units of the table
     uncertainties: dict[str, float] = field(default_factory=dict)  # likewise
-    deviations: dict[str, float] = field(default_factory=dict)  # m, of the next flight, by how the vehicle was known
+    deviations: dict[str, float] = field(default_factory=dict)  # m, of the next flights, by their parameters
 
 
 ERROR_COLUMNS = (
@@ -135,7 +135,7 @@ def fly_drawn(drawn: DrawnVehicle, mission: Mission, folder: Path, seed: int) ->
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a vehicle: its seed. Raises what planning raises."""
+    """Return one case per vehicle: its seed. Raises what planning raises."""
     limits = limits_for(settings.path_file)
     missions = prepare_mission(settings.path_file, limits), prepare_mission(settings.next_file, limits)
     cases = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.vehicles)}
@@ -143,7 +143,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def measure(seed: int, missions: tuple[Mission, Mission], next_file: Path) -> StudiedVehicle:
-    """Identify the vehicle of a seed, and fly on with what was found. Raises what planning raises."""
+    """Identify the vehicle of a seed, and fly the next path with the result. Raises what planning raises."""
     mission, unknown = missions
     drawn = draw_vehicle(seed, mission.limits.airframe)
     weighed = round(drawn.airframe.mass / SCALE_STEP) * SCALE_STEP
@@ -173,7 +173,7 @@ def _limits_of(limits: Limits, found: Identification) -> Limits:
 
 
 def _limits(limits: Limits, airframe: Airframe, latency: float) -> Limits:
-    """Return the limits as the same safety.yaml gives them for another vehicle and latency."""
+    """Return the limits that the same safety.yaml gives for another vehicle and latency."""
     old = limits.airframe
     reserve = (limits.plan.motor_thrust_min - old.motor_thrust_min) / (old.motor_thrust_max - old.motor_thrust_min)
     plan = replace(limits.plan, **within_reserve(airframe, reserve))
@@ -181,7 +181,7 @@ def _limits(limits: Limits, airframe: Airframe, latency: float) -> Limits:
 
 
 def _errors(found: Identification, drawn: DrawnVehicle, nominal: Airframe) -> tuple[dict[str, float], dict[str, float]]:
-    """Return errors and stated uncertainties in %, ms."""
+    """Return errors and stated uncertainties, in % or ms, by quantity."""
     true, quantities = drawn.airframe, found.quantities
     ratio = (true.motor_thrust_max / true.mass) / (nominal.motor_thrust_max / nominal.mass)
     thrust = true.motor_thrust_max / nominal.motor_thrust_max
@@ -199,7 +199,7 @@ def _errors(found: Identification, drawn: DrawnVehicle, nominal: Airframe) -> tu
 
 
 def _deviation(flown: SteppedFlight, mission: Mission) -> float:
-    """Return the largest true distance, m, from the setpoint of the moment along the plan; NaN if it did not land."""
+    """Return the largest true distance, m, from the setpoint of the same time on the plan; NaN if it did not land."""
     outcome, truth = flown.outcome, flown.truth
     if outcome is None or outcome.exit_code is not ExitCode.OK:
         return float("nan")
@@ -212,7 +212,7 @@ def _deviation(flown: SteppedFlight, mission: Mission) -> float:
 
 
 def tables(settings: Settings, rows: list[StudiedVehicle]) -> Iterator[Table]:
-    """Yield how well the vehicles were identified, and how they flew on."""
+    """Yield the errors of identification, and the deviations of the next flights."""
     done = [vehicle for vehicle in rows if not vehicle.reason]
     title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles"
     yield table("errors", title, ERROR_COLUMNS, list(_accuracy(done)))
@@ -236,9 +236,9 @@ def _accuracy(done: Sequence[StudiedVehicle]) -> Iterator[dict[str, Any]]:
 
 @dataclass(frozen=True, slots=True)
 class _NextFlight:
-    vehicle: str  # how it was known
+    vehicle: str  # the parameters that the flight was planned with
     deviation: float  # m; NaN where it did not land
-    over_known: float  # m, more than that of the same vehicle, known
+    over_known: float  # m, in excess of the same vehicle's flight with known parameters
 
 
 def _next_flights(done: Sequence[StudiedVehicle]) -> Iterator[_NextFlight]:

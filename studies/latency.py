@@ -1,8 +1,8 @@
-"""Steer the virtual vehicle in real time: how soon requests change the motion, and how many a second may.
+"""Steer the virtual vehicle in real time, and measure how soon requests change the motion, and at what rate.
 
-Pilot, planner and lab are processes. First the vehicle hovers, for the lateness of its stream alone. Then requests come
-one at a time, each for a tour of 10 m through random waypoints instead of what is ahead. Then they come much faster
-than they can be planned, and the latest wins.
+Pilot, planner and lab are processes. First the vehicle hovers, to measure the lateness of its stream alone. Then
+requests come one at a time, each replacing the path ahead by a tour of 10 m through random waypoints. Then they come
+much faster than they can be planned, and the latest wins.
 """
 
 import os
@@ -35,9 +35,9 @@ from studies.runner.reductions import count, largest, mean, median, quantile
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-HORIZON = 10.0  # m, at least, of straight lines through the waypoints of a request
-_WALL_DISTANCE = 0.5  # m beyond the margin, that those keep
-_PAUSE = (0.2, 0.6)  # s between an answer and the next request, where they come one at a time
+HORIZON = 10.0  # m, least length of the polyline through the waypoints of a request
+_WALL_DISTANCE = 0.5  # m that those waypoints keep from the margin
+_PAUSE = (0.2, 0.6)  # s between an answer and the next request, when they come one at a time
 _HEIGHT = 0.8  # m
 
 _MEDIAN = Column("median", "median", "ms", ".0f", value=median("seconds"))
@@ -77,11 +77,11 @@ RATE_COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How many requests are made, and how fast."""
+    """Number and rate of requests."""
 
     requests: int = option(100, "Requests one at a time.", least=1)
-    seconds: float = option(60.0, "Time of all other requests, s; as long it hovers before.", least=1)
-    rate: float = option(100.0, "Those requests a second.", least=0.1)
+    seconds: float = option(60.0, "Duration of the fast requests, and of hovering before, s.", least=1)
+    rate: float = option(100.0, "Fast requests per second.", least=0.1)
     seed: int = option(0, "Seed of the waypoints.", least=0)
 
 
@@ -96,12 +96,12 @@ class Stretch:
     refused: int
     late: int
     superseded: int
-    p50: float  # s by which setpoints were sent late, as p99, p999 and max_late
+    p50: float  # s, median lateness of setpoints; likewise p99, p999 and max_late
     p99: float
     p999: float
     max_late: float
-    load: float  # of the computer, the mean of the minute before its end
-    replans: Sequence[Mapping[str, float]] = ()  # s, by DELAYS and PARTS, of each accepted request; one at a time alone
+    load: float  # load average of the last minute of the stretch
+    replans: Sequence[Mapping[str, float]] = ()  # s, DELAYS and PARTS by accepted request, if one at a time
 
 
 DELAYS = (  # from the request
@@ -111,17 +111,17 @@ DELAYS = (  # from the request
 )
 PARTS = (  # of the time until the first changed setpoint, in order
     "to the planner's process",  # until it has the request
-    "what it does before",  # until it begins to plan; with its proposals that came late
+    "what it does before",  # until it begins to plan, including earlier proposals that came late
     "plan",
-    "checks",  # bytes, stops, link loss, gaps and dry run of its first part
+    "checks",  # bytes, stops, link loss, gaps and dry run of the plan's first part
     "verified by the pilot",  # which looks every 10 ms, verifies and answers
-    "left until the splice",  # which lies as far ahead as most plans need
+    "left until the splice",  # which is set far enough ahead for most plans
 )
 ONE_BY_ONE = "one request at a time"
 
 
 class HeardSteering(RealTimeSteering):
-    """A flight by processes whose setpoints and commitments are kept."""
+    """A flight in real time that keeps its setpoints and commitments."""
 
     def __init__(self, limits: Limits):
         super().__init__("sim://0", None, limits, ignore_steps, keys=False)
@@ -191,7 +191,7 @@ def measure(settings: Settings, limits: Limits) -> list[Stretch]:
 
 
 def tables(settings: Settings, rows: list[Stretch]) -> Iterator[Table]:
-    """Yield each kind of delay, the parts of the time until the first changed setpoint, and what became of many."""
+    """Yield the delays, the parts of the time until the first changed setpoint, and the outcomes of fast requests."""
     replans = [replan for row in rows for replan in row.replans]
     delays, parts = ([_Duration(what, each[what]) for what in names for each in replans] for names in (DELAYS, PARTS))
     yield table("latency", "Requests one at a time", LATENCY_COLUMNS, delays, by=("what",))
@@ -206,9 +206,9 @@ class _Duration(NamedTuple):
 
 
 def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | None:
-    """Return the number of the first setpoint that is another with setpoints (K, 29) from a splice on; None for none.
+    """Return the number of the first setpoint that `payloads`, (K, 29), change from `splice` on, or None.
 
-    `sequence`, (N, 29), are those before; behind them the last one holds.
+    `sequence`, (N, 29), holds the setpoints before the change; its last one is repeated beyond its end.
     """
     before = sequence[np.minimum(np.arange(splice, splice + len(payloads)), len(sequence) - 1)]
     changed = np.flatnonzero((before != payloads).any(axis=1))
@@ -216,9 +216,9 @@ def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | Non
 
 
 def find_replans(flight: HeardSteering, asked: Mapping[int, float]) -> list[dict[str, float]]:
-    """Return DELAYS and PARTS of each request that was accepted, s, by the bytes that the pilot was bound to.
+    """Return DELAYS and PARTS, s, of each accepted request, by the bytes that the pilot committed to.
 
-    Where the vehicle is to stop first, the first setpoint of that is the one that changes. Raises InputError where none
+    If the vehicle has to stop first, the first changed setpoint is one of that stop. Raises InputError if no request
     was accepted.
     """
     accepted = [each for each in flight.heard if each.verdict is PathVerdict.ACCEPTED and each.number in asked]
@@ -255,7 +255,7 @@ def _parts(answer: PathAnswer, asked: float, changed: float) -> tuple[float, ...
 
 class _Mark(NamedTuple):
     time: float  # s
-    load: float  # of the computer, the mean of the minute before
+    load: float  # load average of the last minute
 
 
 def _mark(vehicle: SteeredVehicle) -> _Mark:
@@ -263,7 +263,7 @@ def _mark(vehicle: SteeredVehicle) -> _Mark:
 
 
 def _stretch(what: str, flight: HeardSteering, asked: Collection[int], begin: _Mark, end: _Mark) -> Stretch:
-    """Return what became of the requests of these numbers, and how late setpoints were sent meanwhile."""
+    """Return the outcomes of the requests of these numbers, and the lateness of setpoints meanwhile."""
     became = Counter(each.verdict for each in flight.heard if each.number in asked)
     late = [each.time - each.due for each in flight.sent.values() if begin.time <= each.due <= end.time]
     p50, p99, p999, most = np.percentile(late, [50, 99, 99.9, 100]).tolist()
@@ -284,7 +284,7 @@ def _stretch(what: str, flight: HeardSteering, asked: Collection[int], begin: _M
 
 
 def _tour(chance: np.random.Generator, begin: Triple, limits: Limits) -> Iterator[Triple]:
-    """Yield random waypoints, of HORIZON m or a little more from a place, m."""
+    """Yield random waypoints, m, of a tour from `begin` that is at least HORIZON long."""
     space = limits.space
     low, high = np.array(space.low) + space.margin, np.array(space.high) - space.margin
     inner = np.minimum(_WALL_DISTANCE, 0.25 * (high - low))

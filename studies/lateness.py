@@ -1,8 +1,8 @@
 """Measure how late setpoints are sent, with record, live view and Vicon, and how late this computer wakes a sleeper.
 
-The real pilot flies PATH in the virtual lab; behind its end the vehicle hovers. Before the flight and meanwhile, a
-process that only sleeps until deadlines shows what the computer itself adds. First by SCHED_FIFO, where the system
-permits it; then without, for which this command gives the permission up.
+The real pilot flies PATH in the virtual lab; after its end the vehicle hovers. Before and during the flight, a process
+that only sleeps until deadlines measures the latency of the computer itself. Everything is measured first with
+SCHED_FIFO, if the system permits it, then without, for which this command drops the permission.
 """
 
 import contextlib
@@ -54,40 +54,40 @@ COLUMNS = (
     Column("remark", "remark"),
 )  # fmt: skip
 FIRST, ORDINARY = "SCHED_FIFO", "ordinary"
-QUEUED = "stream, of that waiting for a processor"  # behind other programs, per period, as the system counts it
+QUEUED = "stream, of that waiting for a processor"  # time in the run queue per period, as the system counts it
 _DROP_CAPABILITY, _NICE_CAPABILITY = 24, 23  # PR_CAPBSET_DROP, CAP_SYS_NICE
 _VIEWER_STARTS = 2.0  # s
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is flown, and for how long."""
+    """The path to fly, and for how long."""
 
     path_file: Path = argument()
-    seconds: float = option(60.0, "Shortest time of streaming, s; behind the end of PATH the vehicle hovers.", least=1)
+    seconds: float = option(60.0, "Shortest time of streaming, s; after the end of PATH the vehicle hovers.", least=1)
 
 
 @dataclass(frozen=True, slots=True)
 class WakeUps:
-    """How late one kind of waking was."""
+    """Latency of one kind of wake-up."""
 
     what: str
     priority: str
-    reason: str  # why there is no measurement, or why it is short; "" where all went well
+    reason: str  # why there is no measurement, or why it is short; "" if it is complete
     seconds: float = math.nan
-    p50: float = math.nan  # s, as p99, p999 and max
+    p50: float = math.nan  # s, median latency; likewise p99, p999 and max
     p99: float = math.nan
     p999: float = math.nan
     max: float = math.nan
     count: int = 0
-    above: float = math.nan  # of the count, by more than 1 ms
-    skipped: int = 0  # deadlines that passed altogether
-    stolen: float = 0.0  # s that the host took from this virtual machine meanwhile, over all its processors
+    above: float = math.nan  # number of wake-ups that were more than 1 ms late
+    skipped: int = 0  # deadlines that were missed altogether
+    stolen: float = 0.0  # s of steal time, over all processors of this virtual machine
     view_failure: str = ""  # why the live view ended early
 
     @staticmethod
     def of(what: str, priority: str, late: Sequence[float], reason: str = "", **others: Any) -> "WakeUps":
-        """Return the percentiles of the s by which each was late."""
+        """Return the percentiles of these latencies, s."""
         p50, p99, p999 = np.percentile(late, [50, 99, 99.9])
         above = int(np.sum(np.array(late) > 1e-3))
         return WakeUps(
@@ -97,7 +97,7 @@ class WakeUps:
 
     @property
     def remark(self) -> str:
-        """Return why it is short, or the live view was."""
+        """Return why the measurement or the live view ended early."""
         return "; ".join(filter(None, (self.reason, self.view_failure)))
 
 
@@ -120,9 +120,9 @@ def work(
     permitted: Callable[[], bool] = may_use_fifo_scheduling,
     give_up: Callable[[], None] = give_up_priority,
 ) -> Work:
-    """Return a case for the sleeper alone and one for the flight, by SCHED_FIFO and then without.
+    """Return a case for the sleeper alone and one for the flight, with SCHED_FIFO and then without.
 
-    Afterwards this process and its children may not use it any more. Others than the real ones may be given.
+    Afterwards this process and its children may no longer use SCHED_FIFO. Tests pass their own callables.
     """
     options = FlightOptions(stream_for=settings.seconds)
     mission = prepare_mission(settings.path_file, limits_for(settings.path_file), options)
@@ -148,16 +148,16 @@ def work(
 
 
 def tables(settings: Settings, rows: list[WakeUps]) -> Iterator[Table]:
-    """Yield a line for each kind of waking and each priority."""
+    """Yield a table with one row per kind of wake-up and priority."""
     yield table("lateness", f"Lateness at {RATE:.0f} Hz", COLUMNS, rows)
 
 
 def _streaming(priority: str, sleeper: Sleeper, fly: Callable[..., RealTimeFlight]) -> list[WakeUps]:
-    """Measure the stream of a flight, and a sleeper over the same seconds."""
+    """Measure the stream of a flight, and a sleeper over the same period."""
     stolen = _stolen()
     flight = fly(name="lateness", view=open_view, on_stream=sleeper.watch)
     if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
-        raise KeyboardInterrupt  # who ends the flight ends the study
+        raise KeyboardInterrupt  # the operator's stop ends the study too
     if not flight.sent or flight.outcome is None:
         return [WakeUps("stream", priority, flight.reason)]
     begin, end = flight.sent[0].due, flight.sent[-1].due
@@ -173,9 +173,9 @@ def _streaming(priority: str, sleeper: Sleeper, fly: Callable[..., RealTimeFligh
 
 @contextlib.contextmanager
 def open_view(header: RecordHeader, program: str | None = None) -> Iterator[LiveView]:
-    """Open the live view with its own viewer, which ends with it; without a screen, one without a window.
+    """Open the live view with its own viewer, which ends with it; without a screen the viewer has no window.
 
-    Raises InputError where the viewer does not run.
+    Raises InputError if the viewer does not run.
     """
     port, screen = free_port(), os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
@@ -206,7 +206,7 @@ def open_view(header: RecordHeader, program: str | None = None) -> Iterator[Live
 
 
 def _stolen() -> float:
-    """Return s so far in which the host of this virtual machine ran something else; 0 where the system does not say."""
+    """Return the steal time of this virtual machine so far, s; 0 if the system does not report it."""
     try:
         fields = Path("/proc/stat").read_text(encoding="ascii").splitlines()[0].split()
         return int(fields[8]) / os.sysconf("SC_CLK_TCK")

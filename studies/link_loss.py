@@ -21,7 +21,7 @@ from studies.runner.study import Run, Study, Work
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown, and how fast."""
+    """The paths to fly, and how fast."""
 
     path_files: tuple[Path, ...] = argument()
     speeds: tuple[float, ...] = option((1.0, 0.6, 0.3), "Factor on the speed that the limits allow.")
@@ -43,13 +43,13 @@ COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case for each path at each speed."""
+    """Return one case per path and speed."""
     cases = product(settings.path_files, settings.speeds)
     return Work({f"{file} at {speed:g}": (file, speed) for file, speed in cases}, measure)
 
 
 def measure(case: tuple[Path, float]) -> dict[str, Any]:
-    """Lose the link at every setpoint of a path at a speed. Raises what planning and encoding raise."""
+    """Simulate link loss at every setpoint of a path at a speed. Raises what planning and encoding raise."""
     path_file, speed = case
     planned = plan_flight(path_file, limits_for(path_file), FlightOptions(speed_factor=speed))
     encoded = encode_flight(planned)
@@ -69,18 +69,18 @@ def measure(case: tuple[Path, float]) -> dict[str, Any]:
 
 
 def _lost(planned: PlannedFlight, watchdog: bool) -> LinkLoss:
-    """Return the worst moment to lose the link of a flight, with setpoints for this."""
+    """Return the worst link loss of a flight, with setpoints encoded for a vehicle with or without watchdog."""
     limits = replace(planned.limits, firmware=replace(planned.limits.firmware, watchdog=watchdog))
     return simulate_link_loss(encode_flight(replace(planned, limits=limits)).payloads, limits)
 
 
 def with_rates(motion: FullStateSetpoints) -> NDArray:
-    """Return the payloads of a motion with its attitudes and body rates as they are, none of them traded."""
+    """Return the payloads of a motion with attitudes and body rates as planned, without trading rates for turns."""
     return encode(replace(motion, quaternion=command_quaternion(motion.quaternion)))
 
 
 def tables(settings: Settings, rows: list[dict[str, Any]]) -> Iterator[Table]:
-    """Yield a line for each path at each speed."""
+    """Yield a table with one row per path and speed."""
     yield table("link-loss", "Link loss at the worst moment", COLUMNS, rows)
 
 

@@ -1,7 +1,7 @@
 """Fly the setpoints of each PATH by RotorPy and by drone-models, and compare with cfplan's own closed loop.
 
-Setpoints, controller and start are the same to the bit: the dry run's. Only the body differs, in equations, in
-parameters or in both, so what differs is what a simulator says and not what flies.
+Setpoints, controller and start are those of the dry run, bit by bit. Only the body differs, in equations, parameters or
+both, so that any difference is one of the simulators.
 """
 
 import math
@@ -28,12 +28,12 @@ from studies.runner.reductions import among, largest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-REALISTIC_LAG, PAPER_LAG = 0.072, 0.005  # s, of the motors: RotorPy's today, and its of the paper's day
+REALISTIC_LAG, PAPER_LAG = 0.072, 0.005  # s, of the motors: RotorPy's current default, and that of the paper's version
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown."""
+    """The paths to fly."""
 
     path_files: tuple[Path, ...] = argument()
 
@@ -43,27 +43,27 @@ class OtherBody:
     """A body to compare with."""
 
     name: str
-    make: Callable[[Airframe], BodyStep]  # raises InputError where the body cannot be had
-    motor_lag: float | None = None  # s, of cfplan's body beside it; None: the airframe's
+    make: Callable[[Airframe], BodyStep]  # raises InputError if the body is not available
+    motor_lag: float | None = None  # s, of cfplan's body that it is compared with; None: the airframe's
 
     def beside(self, airframe: Airframe) -> Airframe:
-        """Return the airframe of cfplan's body beside it."""
+        """Return the airframe of cfplan's body that it is compared with."""
         return airframe if self.motor_lag is None else replace(airframe, motor_time_constant=self.motor_lag)
 
 
 @dataclass(frozen=True, slots=True)
 class ComparedFlight:
-    """The setpoints of one path, flown by one body and by cfplan's, or why that body does not fly."""
+    """The setpoints of one path flown by one body and by cfplan's, or the reason why that body does not fly."""
 
     path: str
     body: str
     reason: str = ""  # why it does not fly
     motor_lag: float = math.nan  # s, of cfplan's body
     duration: float = math.nan  # s, of the motion
-    deviation: float = math.nan  # m, the other body's largest distance from where the trajectory is at that time
+    deviation: float = math.nan  # m, largest distance of the other body from the trajectory at the same time
     own_deviation: float = math.nan  # m, that of cfplan's body
     apart: float = math.nan  # m, largest distance of the two at the same time
-    apart_time: float = math.nan  # s, when that was
+    apart_time: float = math.nan  # s, time of that distance
     apart_rms: float = math.nan  # m
 
 
@@ -74,12 +74,12 @@ BODIES = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path."""
+    """Return one case per path."""
     return Work({str(file): file for file in settings.path_files}, measure, ComparedFlight)
 
 
 def measure(path_file: Path, bodies: Sequence[OtherBody] = BODIES) -> list[ComparedFlight]:
-    """Fly the setpoints of a path by each body. Raises InputError where none of them can be had."""
+    """Fly the setpoints of a path with each body. Raises InputError if none of them is available."""
     limits = limits_for(path_file)
     planned = plan_flight(path_file, limits)
     encoded, trajectory, airframe = encode_flight(planned), planned.plan.trajectory, limits.airframe
@@ -99,9 +99,9 @@ def compared(
     path: str, body: OtherBody, encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe,
     limits: FlightLimits,
 ) -> ComparedFlight:  # fmt: skip
-    """Return how setpoints are followed by a body and by cfplan's; the controller believes in `airframe`.
+    """Compare how a body and cfplan's own follow setpoints; the controller assumes `airframe`.
 
-    Raises InputError where the body cannot be had.
+    Raises InputError if the body is not available.
     """
     own_body = body.beside(airframe)
     times, theirs = fly_on(body.make(airframe), encoded, trajectory, airframe)
@@ -120,7 +120,7 @@ def _largest(errors: NDArray) -> float:
 
 
 def tables(settings: Settings, rows: list[ComparedFlight]) -> Iterator[Table]:
-    """Yield the largest deviation by each body beside that by cfplan's, and how far the two are apart."""
+    """Yield the largest deviations of each body and of cfplan's, and the distance between the two."""
     flown = [row for row in rows if not row.reason]
     columns = [Column("path", "path"), Column("duration", "flight", "s", ".1f")]
     for k, (name, lag) in enumerate({row.body: row.motor_lag for row in flown}.items()):

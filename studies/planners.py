@@ -1,11 +1,11 @@
-"""Compare planners on the same paths: time to certificate and to setpoints, time of flight, and what the dry run says.
+"""Compare planners on the same paths: time to certificate and to setpoints, time of flight, and the dry run.
 
 Workloads: `random` paths in two boxes under two sets of limits; `lengths`, paths of 1 to 100 times the usual length;
-`drawn`, limits and vehicles drawn at random, within and outside of what the shipped network was trained on; `hard`,
-adversarial paths under limits from a hundredth to ten times those of safety.yaml, planned by `auto` within its budget.
+`drawn`, limits and vehicles drawn at random, within and outside the shipped network's training distribution; `hard`,
+adversarial paths under limits 0.01 to 10 times those of safety.yaml, planned by `auto` within its budget.
 
-Every path is given to every planner before the next one, in the opposite order on every other path, so that other load
-and processor caches meet all alike. Times are processor time; no planner's first path counts.
+All planners plan a path before the next one begins, in reverse order on every other path, so that other load and
+processor caches affect all alike. Times are processor time; each planner is warmed up before it is timed.
 """
 
 import signal
@@ -50,15 +50,15 @@ from studies.runner.study import Run, Study, Work
 
 LENGTHS = (20.0, 40.0, 100.0, 200.0, 400.0, 1000.0, 2000.0)  # m, 1 to 100 times the mean of the paper's paths
 EXPERT, TOPPQUAD = "expert", "toppquad"
-FLOWN = ("learned", EXPERT)  # whose setpoints are encoded and rehearsed
-REFINED = ("learned", "convex")  # whose profiles are proposals, refined to the optimum
-LOST = 1.0  # m from its place: a dry run that gets there has failed
-PATIENCE = 5.0  # budgets after which a path counts as hanging
-ENDURANCE, ROOM = 1e6, 3000.0  # s that the battery lasts and m to each side, where paths are hard
+FLOWN = ("learned", EXPERT)  # planners whose setpoints are encoded and rehearsed
+REFINED = ("learned", "convex")  # planners whose profiles are refined to the optimum
+LOST = 1.0  # m, deviation at which a dry run has failed
+PATIENCE = 5.0  # multiple of the budget after which planning counts as hanging
+ENDURANCE, ROOM = 1e6, 3000.0  # s of battery life and m of room to each side, for hard paths
 
 
 class Workload(StrEnum):
-    """Which paths are planned."""
+    """The groups of paths to plan."""
 
     RANDOM = "random"
     LENGTHS = "lengths"
@@ -67,17 +67,17 @@ class Workload(StrEnum):
 
 
 class Answer(StrEnum):
-    """What became of a path."""
+    """The outcome of planning a path."""
 
     CERTIFIED = "certified"
     REFUSED = "refused"  # with a reason and a hint
-    FAILED = "failed"  # an error that is no answer
+    FAILED = "failed"  # an error without a hint, or no certificate
     HANGS = "hangs"
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What is planned, and by whom."""
+    """The paths to plan, and the planners."""
 
     workload: Workload = option(Workload.RANDOM, "Which paths.")
     paths: int = option(100, "Paths of each group.", least=1)
@@ -116,25 +116,25 @@ class Trial:
     length: float  # m
     nodes: int
     answer: str = Answer.FAILED
-    reason: str = ""  # why there is no certified flight
-    plan_seconds: float = np.nan  # of the planner's call
-    solve_seconds: float = np.nan  # of its solver alone, as the solver says
-    finish_seconds: float = np.nan  # to refine, repair and certify
-    encode_seconds: float = np.nan  # to encode and certify the setpoints
-    worst_usage: float = np.nan  # of any limit on the dense grid, before repair
+    reason: str = ""  # why there is no certified flight; empty if there is one
+    plan_seconds: float = np.nan  # s, of the planner's call
+    solve_seconds: float = np.nan  # s, of its solver alone, as the solver reports
+    finish_seconds: float = np.nan  # s, to refine, repair and certify
+    encode_seconds: float = np.nan  # s, to encode and certify the setpoints
+    worst_usage: float = np.nan  # largest usage of any limit on the dense grid, before repair
     planned_time: float = np.nan  # s of flight, before repair
     certified_time: float = np.nan  # s of flight
-    speed_factor: float = np.nan  # of slowing as a whole; 1: not slowed
-    bound: float = np.nan  # s, no flight within speed, acceleration and collective thrust is faster
-    memory: float = np.nan  # MB by which the process grew at most
+    speed_factor: float = np.nan  # by which the entire flight was slowed down; 1: not at all
+    bound: float = np.nan  # s, lower bound of any flight within speed, acceleration and collective thrust
+    memory: float = np.nan  # MB, largest growth of the process
     budget: float = np.nan  # s for planning
-    left_out: str = ""  # what there was no time for
-    bytes_refused: str = ""  # why its setpoints would not be sent
+    left_out: str = ""  # steps left out for lack of time
+    bytes_refused: str = ""  # why its setpoints were refused; empty if they were not
     deviation: float = np.nan  # m, in the dry run
-    dry_run: str = ""  # why it failed
+    dry_run: str = ""  # why the dry run failed; empty if it passed
     expert_time: float = np.nan  # s, the expert's certified flight along the same path
-    expert_seconds: float = np.nan  # of the processor, to the expert's certificate
-    toppquad_seconds: float = np.nan  # of TOPPQuad's solver alone
+    expert_seconds: float = np.nan  # s of processor time, to the expert's certificate
+    toppquad_seconds: float = np.nan  # s, of TOPPQuad's solver alone
 
     @property
     def seconds(self) -> float:
@@ -148,7 +148,7 @@ class Trial:
 
     @property
     def against_expert(self) -> float:
-        """Return how much longer its certified flight is than the expert's, relative."""
+        """Return the certified time over the expert's, as a relative excess."""
         return self.certified_time / self.expert_time - 1.0
 
     @property
@@ -229,7 +229,7 @@ ANSWER_COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path; each makes a trial a planner."""
+    """Return one case per path; each yields one trial per planner."""
     cases = {f"{group} {seed}": (group, seed) for group, seed in _cases(settings)}
     return Work(cases, partial(measure, settings), Trial)
 
@@ -253,7 +253,7 @@ def _cases(settings: Settings) -> Iterator[tuple[Any, int]]:
 
 
 def measure(settings: Settings, named: tuple[Any, int]) -> list[Trial]:
-    """Plan one path by each planner; a path that makes no task is refused for all."""
+    """Plan one path with each planner; a path that is refused before planning counts as refused by all."""
     group, seed = named
     if settings.workload is Workload.HARD:
         return [_hard_trial(seed)]
@@ -270,7 +270,7 @@ def measure(settings: Settings, named: tuple[Any, int]) -> list[Trial]:
     if EXPERT in reference:
         best = reference[EXPERT]
         if settings.workload is Workload.DRAWN and not best.certified:
-            return []  # limits that exclude the path
+            return []  # the limits exclude the path
         trials = [replace(t, expert_time=best.certified_time, expert_seconds=best.seconds) for t in trials]
     if TOPPQUAD in reference:
         trials = [replace(t, toppquad_seconds=reference[TOPPQUAD].solve_seconds) for t in trials]
@@ -278,7 +278,7 @@ def measure(settings: Settings, named: tuple[Any, int]) -> list[Trial]:
 
 
 def _case(settings: Settings, group: Any, seed: int) -> Case:
-    """Return the path of that seed in that group of the workload, with its limits."""
+    """Return the path of a seed in a group of the workload, with its limits."""
     if settings.workload is Workload.DRAWN:
         path, chosen, yaw, angle = draw_case(group, seed)
         return Case(group, seed, path, chosen, 100, yaw, angle)
@@ -344,7 +344,7 @@ def _rehearsed(trial: Trial, trajectory: Trajectory | None, chosen: LimitSet) ->
 
 @cache
 def _warm_up(name: str, limits: str) -> None:
-    """Compile and load what a planner needs, once a process."""
+    """Compile and load what a planner needs, once per process."""
     chosen, path = LIMIT_SETS.get(limits, LIMIT_SETS["hardware"]), random_path(0, next(iter(BOXES)))
     with suppress(CfplanError):
         _planned(Trial("", 0, name, path.length, 100), Case("", 0, path, chosen, 100))
@@ -358,22 +358,22 @@ def _lost_alone() -> FlightLimits:
 
 
 def _memory_begins() -> float:
-    """Begin the peak of this process's memory anew, where Linux permits it; return what it uses, MB."""
+    """Reset the peak memory of this process, if Linux permits it, and return its present memory, MB."""
     with suppress(OSError):
         File("/proc/self/clear_refs").write_text("5")
     return process_memory("VmRSS")
 
 
-# Hard paths: planned as users plan, within the budget; every few by the expert too, without one.
+# Hard paths: planned as users plan, within the budget; every COMPARED-th also by the expert, without a budget.
 
 
 class _HangsError(Exception):
-    """A path took many times its budget."""
+    """Planning took PATIENCE times its budget."""
 
 
 @contextmanager
 def _patience(seconds: float) -> Iterator[None]:
-    """Raise _HangsError in the block after that much processor time."""
+    """Raise _HangsError in the block after this much processor time, s."""
 
     def hang(*_: Any) -> None:
         raise _HangsError
@@ -386,7 +386,7 @@ def _patience(seconds: float) -> Iterator[None]:
         signal.setitimer(signal.ITIMER_PROF, 0.0)
 
 
-COMPARED = 7  # of so many hard paths one is planned by the expert, too
+COMPARED = 7  # also run the expert on every Nth hard path
 
 
 def _hard_trial(seed: int) -> Trial:
@@ -424,7 +424,7 @@ def _hard_trial(seed: int) -> Trial:
 
 @cache
 def _roomy_limits() -> Limits:
-    """Return the limits of safety.yaml with room and battery for every path, once a process; machine code is loaded."""
+    """Return safety.yaml's limits with room and battery for every path, and load machine code, once per process."""
     limits = load_limits(REPOSITORY / "safety.yaml")
     space = Space((-ROOM,) * 3, (ROOM,) * 3, 0.0)
     limits = replace(limits, space=space, battery=replace(limits.battery, endurance=ENDURANCE))
@@ -433,7 +433,7 @@ def _roomy_limits() -> Limits:
 
 
 def tables(settings: Settings, trials: list[Trial]) -> Iterator[Table]:
-    """Yield time and flights of each planner on each group of paths; of hard paths, what became of them."""
+    """Yield times and flights by group and planner; for hard paths the outcomes by family."""
     of = f"{settings.workload} paths"
     if settings.workload is Workload.HARD:
         yield table("answers", "Adversarial paths, planned within the budget", ANSWER_COLUMNS, trials, by=("group",),

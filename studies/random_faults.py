@@ -1,9 +1,9 @@
-"""Fly along each PATH in turn with random faults, by seeds: none may leave the walls, each must end disarmed.
+"""Fly along each PATH in turn with random faults, by seed: none may leave the walls, each must end disarmed.
 
-The seed of a flight determines its path, the phase and moment of the first fault, one to three faults at once with
-their lengths and sizes, whether logs or acknowledgements fall silent as well, and in two flights of five the death of
-the pilot or the radio. The vehicle is then alone and comes down by its own time-outs; its last setpoint must have been
-harmless. A flight of the tables is flown again by its seed, with the same paths.
+The seed of a flight determines its path, the phase and moment of the first fault, one to three overlapping faults with
+their durations and sizes, whether logs or acknowledgements fall silent as well, and in two flights of five the death of
+the pilot or the radio. The vehicle is then left to its own time-outs, and its last setpoint must have been harmless. To
+repeat a flight of the tables, give its seed and the same paths.
 """
 
 import contextlib
@@ -38,20 +38,20 @@ from studies.runner.reductions import count, largest, smallest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-_LENGTH, _SPREAD = 0.5, 1.2  # s and its logarithm's deviation: a twentieth of a second to some seconds
-_FRACTION_FOR_GOOD = 0.1  # of the faults
+_LENGTH, _SPREAD = 0.5, 1.2  # median, s, and standard deviation of the logarithm of a fault's duration
+_FRACTION_FOR_GOOD = 0.1  # of the faults: they never end
 _FRACTION_DEAD = 0.4  # of the flights: the pilot or the radio dies
 _MANY = (0.5, 0.3, 0.2)  # fraction of flights with one, two, three faults
 _APART = 1.5  # s within which several faults begin
-_BESIDE_START = 0.4  # m from the path's start at which the vehicle stands
-_INSIDE = 0.02  # m that it stands inside the margin, as preflight measures its place
+_BESIDE_START = 0.4  # m, largest offset of the vehicle from the path's start, along x and y
+_INSIDE = 0.02  # m that the vehicle stands inside the margin, which preflight checks by a measured position
 _GROUPS: dict[type, tuple[str, Any]] = {
     FaultKind: ("pose", ViconFault), RadioFaultKind: ("radio", RadioFault), VehicleFaultKind: ("vehicle", VehicleFault),
 }  # fmt: skip
 _LONGEST_STALL = 5.0  # s
 _WORST = 10
 
-# In which something goes wrong, as likely as they are often here, and up to how many s after each began.
+# Phases in which a fault begins, repeated by their weight, and the latest moment, s, after the phase began.
 _PHASES: tuple[tuple[Phase, float], ...] = (
     (Phase.CONFIGURE, 1.0),
     (Phase.CONVERGE, 1.0),
@@ -64,11 +64,11 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
     *((Phase.STREAM, math.inf),) * 6,
     (Phase.HOLD, 1.0),
     *((Phase.LAND, 2.5),) * 2,
-    (Phase.LAND, 6.0),  # until it lies on the floor
+    (Phase.LAND, 6.0),  # late enough to reach the floor
 )
 
 _FRACTION_SILENT = 0.35  # of the flights: logs or acknowledgements fall silent
-_FRACTION_FLAPPING = 0.4  # of those: they come back for a moment
+_FRACTION_FLAPPING = 0.4  # of those: the sources come back for a moment
 _BACK_FOR = 0.1  # s
 # Sources that fall silent together.
 _SILENCES: tuple[tuple[Any, ...], ...] = (
@@ -80,7 +80,7 @@ _SILENCES: tuple[tuple[Any, ...], ...] = (
 
 _STALL, _MAIN, _PILOT = "stall", "main process killed", "pilot killed"
 
-# Kind, and the least and most size where it has one.
+# Kind, and the least and greatest size if it has one.
 _KINDS: tuple[tuple[Any, float, float], ...] = (
     (FaultKind.OCCLUDE, 0, 0),
     (FaultKind.STALL, 0, 0),
@@ -107,7 +107,7 @@ _KINDS: tuple[tuple[Any, float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which flights are drawn."""
+    """The flights to draw."""
 
     path_files: tuple[Path, ...] = argument()
     flights: int = option(10_000, "Flights with random faults.", least=1)
@@ -116,7 +116,7 @@ class Settings:
 
 
 class _Grouped(NamedTuple):
-    """A flight as one of a group; it may be of several."""
+    """A flight as a member of one group; it may belong to several."""
 
     group: str
     flight: FaultFlight
@@ -152,7 +152,7 @@ def _end(flight: FaultFlight) -> str:
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a seed; the missions are the same for all. Raises what preparing raises."""
+    """Return one case per seed; the missions are the same for all. Raises what preparing raises."""
     missions = prepare_missions(settings.path_files, settings.random_paths)
     seeds = range(settings.seed, settings.seed + settings.flights)
     return Work({str(seed): seed for seed in seeds}, partial(fly_random, missions=missions), FaultFlight)
@@ -161,7 +161,7 @@ def work(settings: Settings, run: Run) -> Work:
 def prepare_missions(path_files: Sequence[Path], random_paths: int = 0) -> dict[str, Mission]:
     """Prepare each path once, as for a flight, and small random ones under the limits of the first.
 
-    A random path that may not fly is left out. Raises what preparing raises for the others.
+    Random paths that are refused are left out. Raises what preparing raises for the others.
     """
     missions = {file.stem: prepare_flight(file, limits_for(file)).mission for file in path_files}
     limits = limits_for(path_files[0])
@@ -180,7 +180,7 @@ def prepare_missions(path_files: Sequence[Path], random_paths: int = 0) -> dict[
 
 
 def random_scenario(seed: int, mission: Mission) -> Scenario:
-    """Draw what goes wrong in flight number `seed` along a mission, and where the vehicle stands before it."""
+    """Draw the faults of flight number `seed` along a mission, and the place of the vehicle before it."""
     chance = np.random.default_rng(seed)
     phase, within = _PHASES[chance.integers(len(_PHASES))]
     moment = float(chance.uniform(0.0, min(within, mission.duration)))
@@ -218,7 +218,7 @@ def random_scenario(seed: int, mission: Mission) -> Scenario:
 
 
 def with_silence(scenario: Scenario, seed: int) -> Scenario:
-    """Return the scenario; in a fraction of the flights, logs or acknowledgements fall silent as well."""
+    """Return the scenario; for a fraction of the seeds, logs or acknowledgements fall silent as well."""
     chance = np.random.default_rng((seed, 1))
     if chance.random() > _FRACTION_SILENT:
         return scenario
@@ -259,7 +259,7 @@ def _text(kind: Any, start: float, length: float, size: float | None) -> str:
 
 
 def fly_random(seed: int, missions: Mapping[str, Mission]) -> FaultFlight:
-    """Fly flight number `seed` along one of the paths, with a record."""
+    """Fly flight number `seed` along one of the paths, and record it."""
     names = sorted(missions)
     name = names[seed % len(names)]
     scenario = with_silence(random_scenario(seed, missions[name]), seed)
@@ -267,7 +267,7 @@ def fly_random(seed: int, missions: Mapping[str, Mission]) -> FaultFlight:
 
 
 def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
-    """Yield the flights by number of faults, kind and phase, those nearest to a wall, and all that went wrong."""
+    """Yield the flights by number of faults, kind and phase, those nearest to a wall, and the failed ones."""
     outside, bad = sum(row.to_wall <= 0.0 for row in rows), [row for row in rows if row.bad]
     title, phases = f"{len(rows)} flights, {outside} outside the walls", list(map(str, Phase))
     counted = sorted(((len(_kinds(row)), row) for row in rows), key=itemgetter(0))
@@ -282,7 +282,7 @@ def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
 
 
 def _kinds(flight: FaultFlight) -> list[str]:
-    """Return the kind of each of its faults."""
+    """Return the kinds of its faults."""
     return [fault.split(" ", 1)[0] for fault in flight.name.split(" + ")]
 
 

@@ -1,4 +1,4 @@
-"""Fly a mission in real time on the virtual Crazyflie: the pilot's process, cflib, packets, poses and a record."""
+"""Fly a mission in real time on the virtual Crazyflie, with the pilot's process, cflib, packets, poses and a record."""
 
 import multiprocessing
 import tempfile
@@ -33,11 +33,11 @@ _MOST_NOISE = 1.0  # m
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What the lab is like."""
+    """Conditions of the lab: radio loss, pose noise, motion capture."""
 
     loss: float = 0.0  # fraction of the radio's transmissions
     pose_noise: float = 0.001  # m, standard deviation of each axis
-    vicon: bool = False  # poses by Vicon's protocol, through its client in its own process; else straight from the room
+    vicon: bool = False  # poses through Vicon's protocol and client; else directly from the room
     seed: int = 0  # of all noise
 
     def __post_init__(self) -> None:
@@ -50,14 +50,14 @@ class Conditions:
 
 @dataclass(slots=True)
 class RealTimeFlight:
-    """What a flight in real time left behind."""
+    """The outcome of a flight in real time, with its setpoints and truth."""
 
-    outcome: FlightOutcome | None  # None where there was no vehicle, or there were no poses
-    reason: str  # how it ended, one line
-    refusals: int = 0  # tries before it that preflight refused only because this computer was late
+    outcome: FlightOutcome | None  # None if there was no vehicle or no pose
+    reason: str  # how it ended, in one line
+    refusals: int = 0  # earlier attempts that preflight refused only because this computer was late
     sent: list[SetpointSent] = field(default_factory=list)  # the plan's setpoints
     truth: Truth | None = None
-    view_failure: str = ""  # why the live view ended early
+    view_failure: str = ""  # why the live view ended early; empty if it did not
 
     @property
     def landed(self) -> bool:
@@ -65,7 +65,7 @@ class RealTimeFlight:
         return self.outcome is not None and self.outcome.exit_code is ExitCode.OK
 
     def time_to(self, index: int) -> float:
-        """Return s from the first setpoint sent to the first of this number or a later one; 0 where there was none."""
+        """Return the time, s, from the first setpoint sent to the first numbered `index` or higher; 0 if none."""
         ended = (message.time for message in self.sent if message.index >= index)
         return next(ended, self.sent[0].time) - self.sent[0].time if self.sent else 0.0
 
@@ -74,7 +74,7 @@ View = Callable[[RecordHeader], AbstractContextManager[LiveView]]
 
 
 def simulated_lab(mission: Mission, conditions: Conditions) -> Lab:
-    """Start the lab of these conditions."""
+    """Start a lab with these conditions."""
     noise, seed = conditions.pose_noise, conditions.seed
     cameras = ViconSettings(position_noise=noise, seed=seed) if conditions.vicon else None
     lab = start_lab(
@@ -97,10 +97,10 @@ def fly_in_real_time(
     pilot: Callable[..., FlightOutcome] = fly,
     start: Callable[[Mission, Conditions], Lab] = simulated_lab,
 ) -> RealTimeFlight:
-    """Fly it; again where preflight refused for lateness alone. A failure is in the result's reason, not raised.
+    """Fly a mission; retry if preflight refuses for lateness alone. A failure is the result's reason, not raised.
 
-    `on_stream` is called with the number of the pilot's process when the stream begins. `pilot` flies like `fly` in
-    the lab that `start` returns.
+    `on_stream` is called with the process id of the pilot when the stream begins. `pilot` flies like `fly` in the lab
+    that `start` returns.
     """
     refusals = 0
     while True:
@@ -112,7 +112,7 @@ def fly_in_real_time(
 
 
 def patient(limits: Limits) -> Limits:
-    """Return the limits, so that lateness neither refuses nor ends a flight in which it is measured."""
+    """Return limits under which lateness neither refuses nor ends a flight that measures it."""
     pose = replace(limits.pose, age_warning=0.15, age_brake=0.5, age_land=1.5)
     return replace(limits, pose=pose, lateness=1.0)
 
@@ -165,7 +165,7 @@ def _fly_once(
 
 
 def _pilot() -> int:
-    """Return the number of the pilot's process."""
+    """Return the process id of the pilot."""
     pilots = (child.pid for child in multiprocessing.active_children() if child.name == "pilot")
     return next(pilots, 0) or 0
 

@@ -1,4 +1,4 @@
-"""Measure wake-up latency by a process that only sleeps until deadlines: the computer makes every program as late."""
+"""Measure wake-up latency with a process that only sleeps until deadlines: the latency that any program sees."""
 
 import contextlib
 import gc
@@ -17,10 +17,10 @@ _WATCH, _LATE, _QUEUED, _END = "watch", "late", "queued", None
 
 
 class Sleeper:
-    """A process that sleeps until deadlines while the block lasts, with the priority of the stream's thread."""
+    """A context manager that runs a process which sleeps until deadlines, with the priority of the stream's thread."""
 
     def __init__(self, rate: float, *, first: bool):
-        """Start it. `rate` is in Hz; `first`: by SCHED_FIFO."""
+        """Start the process. `rate` is in Hz; `first`: use SCHED_FIFO."""
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_sleep, args=(theirs, rate, first), name="sleeper", daemon=True)
@@ -28,7 +28,7 @@ class Sleeper:
         theirs.close()
 
     def __enter__(self) -> "Sleeper":
-        self._connection.recv()  # it sleeps by now
+        self._connection.recv()  # wait until it sleeps
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -37,7 +37,7 @@ class Sleeper:
         self._connection.close()
 
     def watch(self, process: int) -> None:
-        """Begin to note at each waking how long that process's first thread waited for a processor."""
+        """Begin to record, at each wake-up, how long the main thread of a process waited for a processor."""
         self._connection.send((_WATCH, process))
 
     def late(self, begin: float = -math.inf, end: float = math.inf) -> list[float]:
@@ -45,7 +45,7 @@ class Sleeper:
         return [late for _, late in self._ask(_LATE, begin, end)]
 
     def queued(self, begin: float, end: float) -> list[float]:
-        """Return s that the watched thread waited in each period of [begin, end]; empty where that is not known."""
+        """Return the waiting time, s, of the watched thread in each period of [begin, end]; empty if unknown."""
         totals = [total for _, total in self._ask(_QUEUED, begin, end)]
         return [later - earlier for earlier, later in pairwise(totals)]
 
@@ -69,7 +69,7 @@ def _sleep(connection: Connection, rate: float, first: bool) -> None:
         due = deadlines.wait()
         noted[_LATE].append((due, time.monotonic() - due))
         if watched is not None:
-            with contextlib.suppress(OSError):  # it has ended
+            with contextlib.suppress(OSError):  # the process has ended
                 noted[_QUEUED].append((due, int(watched.read_text(encoding="ascii").split()[1]) / 1e9))
         if not connection.poll():
             continue

@@ -1,8 +1,8 @@
 """Steer the virtual Crazyflie by random requests in the stepped lab, and judge every setpoint that was streamed.
 
-The seed of a flight determines where the vehicle stands, how long its planner takes, and the requests, at any moment
-and in bursts: to extend, replace, stop, fly slower or faster; some lie outside, cannot be flown, or are garbage; some
-meet a fault of the planner. No limit may be exceeded.
+The seed of a flight determines where the vehicle stands, how long its planner takes, and the requests, which come at
+any moment and in bursts: extend, replace, stop, fly slower or faster. Some lie outside the room, cannot be flown, or
+are garbage; some coincide with a fault of the planner. No limit may be exceeded.
 """
 
 import contextlib
@@ -41,11 +41,11 @@ from studies.runner.reductions import count, largest, mean, smallest, total
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-_PLANNING = (0.02, 0.05, 0.1, 0.3)  # s, that the planner of a flight takes for a plan
-_BURST_FRACTION, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # of the requests, how many together, s between them
-_FAULT_FRACTION = 0.03  # of the requests: the planner fails with it
+_PLANNING = (0.02, 0.05, 0.1, 0.3)  # s, planning times, one of which is drawn for each flight
+_BURST_FRACTION, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # fraction of bursts, requests in a burst, s between them
+_FAULT_FRACTION = 0.03  # of the requests: the planner has a fault
 _TAKE_OFF_HEIGHT = (0.5, 1.2)  # m
-_NEAR = 0.3  # m before or behind the vehicle, where waypoints are too near to turn at speed
+_NEAR = 0.3  # m from the target, along each axis: waypoints too near to turn to at speed
 _FRACTIONS = {"extend": 0.30, "replace": 0.28, "stop": 0.07, "slower": 0.05, "faster": 0.08, "near": 0.08,
               "outside": 0.07, "garbage": 0.07}  # fmt: skip
 _GARBAGE: tuple[Any, ...] = (
@@ -54,15 +54,15 @@ _GARBAGE: tuple[Any, ...] = (
 )  # fmt: skip
 _TEXTS = ("1 2", "replace", "stop now", "\x00\xff", "fly 1 2 3", "nan nan", "1,2,3,4", "stop 1 2 3", "1.0 0.0 one")
 _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
-_ENDS = ("flown", "landed", "stopped and landed")  # how a flight is ended: at its end, in motion, after a stop
+_ENDS = ("flown", "landed", "stopped and landed")  # end of a flight: at the end of its path, in motion, after a stop
 _BAD_SHOWN = 20
-_STANDING = 1e-9  # m/s, up to which a motion stands still
+_STANDING = 1e-9  # m/s, speed up to which a motion counts as at rest
 Judge = Callable[[dict[int, SetpointSent], list[Committed], Limits], SequenceVerdict]
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which flights are drawn."""
+    """The flights to draw."""
 
     flights: int = option(40, "Flights.", least=1)
     requests: int = option(250, "Requests of each flight; the last may be those of a burst.", least=1)
@@ -75,19 +75,19 @@ class SteeredFlight:
     """One flight with random requests."""
 
     seed: int
-    planning: float  # s, that a plan takes
-    seconds: float  # of flight along what was committed
+    planning: float  # s, planning time
+    seconds: float  # s of flight along committed setpoints
     requests: int
     accepted: int
-    refused: int  # by the planner or the pilot, in words
+    refused: int  # by the planner or the pilot, with a reason
     late: int
     superseded: int
-    invalid: int  # refused before they were asked for, as no waypoints
+    invalid: int  # refused before planning, as they are not waypoints
     unanswered: int
     ended: str
-    end: str  # in words, as the pilot says it
-    landed: bool  # on the floor, disarmed, by the operator or at its end
-    deviation: float  # m, the largest from the setpoint
+    end: str  # the pilot's reason
+    landed: bool  # on the floor and disarmed, at the end of the path or by the operator
+    deviation: float  # m, largest distance from the setpoint
     to_wall: float  # m, least distance of the true position from walls and ceiling
     setpoints: int
     missing: int
@@ -112,7 +112,7 @@ class SteeredFlight:
 
     @property
     def bad(self) -> bool:
-        """Return whether anything of it went wrong."""
+        """Return whether anything went wrong in the flight."""
         return bool(self.faults) or not self.landed or self.unanswered > 0 or self.to_wall <= 0.0
 
 
@@ -162,7 +162,7 @@ BAD_COLUMNS = (
 
 
 class WatchedSteering(SteppedSteering):
-    """A flight in the stepped lab whose setpoints and commitments are kept."""
+    """A flight in the stepped lab that keeps its setpoints and commitments."""
 
     def __init__(self, limits: Limits, *, planning: float, seed: int, vehicle: VehicleSettings):
         super().__init__(limits, planning=planning, seed=seed, vehicle=vehicle)
@@ -176,7 +176,7 @@ class WatchedSteering(SteppedSteering):
             if isinstance(message, PhaseEntered):
                 self._flies_plan = message.phase in (Phase.STREAM, Phase.HOLD)
             elif isinstance(message, Event) and message.text.startswith(_RUNGS):
-                self._flies_plan = False  # it leaves the plan, for a stop or a landing
+                self._flies_plan = False  # the vehicle leaves the plan for a stop or a landing
             elif isinstance(message, SetpointSent) and self._flies_plan:
                 self.sent.setdefault(message.index, message)
             listeners.telemetry(message)
@@ -192,9 +192,9 @@ class WatchedSteering(SteppedSteering):
         self.planner.on_committed = lambda made: self._keep(made.held, made.proposal.splice)
 
     def _keep(self, held: HeldFlight, splice: int) -> None:
-        """Keep what is held with a commitment from a splice on, of its stops their ends.
+        """Keep the setpoints, motion and first and last setpoints of the stops of a commitment, from its splice on.
 
-        In a hover the pilot takes a proposal that begins elsewhere than it was made for: all of it is flown later then.
+        In a hover the pilot may accept a proposal at a later splice than it was made for; all of it is then delayed.
         """
         commitment, flown = held.commitment, held.flown
         later = commitment.splices[-1] - splice if commitment.splices else 0
@@ -208,7 +208,7 @@ class WatchedSteering(SteppedSteering):
         rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])
-        if held.exact_from > 0:  # a stop that was asked for
+        if held.exact_from > 0:  # a requested stop
             stop = splice + later, held.exact_from + later
         else:
             stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
@@ -216,10 +216,10 @@ class WatchedSteering(SteppedSteering):
 
 
 def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTrajectory:
-    """Return a motion that was proposed from setpoint `splice` on, as it is flown so many setpoints later.
+    """Return a motion proposed from setpoint `splice` on, delayed by `later` setpoints.
 
-    The vehicle hovers on until then: also what was committed to begin meanwhile is flown by nobody. What the proposal
-    leaves moves later too where it moves already, by less than the pilot tells from a hover.
+    The vehicle hovers until then, so that motions committed to begin meanwhile are not flown. If the leg that the
+    proposal continues already moves there, too slowly for the pilot to tell from a hover, that leg is delayed too.
     """
     begins = splice / RATE
     if np.linalg.norm(flown.at(begins).velocity) > _STANDING:
@@ -231,7 +231,7 @@ def flown_later(flown: JoinedTrajectory, splice: int, later: int) -> JoinedTraje
 def fly_steered(
     seed: int, limits: Limits, requests: int, seconds: float, judge: Judge = judge_sequence
 ) -> SteeredFlight:
-    """Fly number `seed`, with so many requests in so many s, and judge it by what it streamed and by the truth."""
+    """Fly number `seed` with `requests` requests in `seconds`, and judge it by its setpoints and by the truth."""
     chance = np.random.default_rng(seed)
     planning = float(chance.choice(_PLANNING))
     flight = WatchedSteering(limits, planning=planning, seed=seed, vehicle=_vehicle(seed, limits, chance))
@@ -289,7 +289,7 @@ def _requests(
     count: int,
     seconds: float,
 ) -> Iterator[tuple[Wish, Any, float]]:
-    """Yield wishes with their waypoints and the pause after each, s, and let the planner fail now and then."""
+    """Yield requests with their waypoints and the pause after each, s; set planner faults at random."""
     mean_burst = sum(_BURST) / 2.0
     apart = seconds / count * (1.0 + _BURST_FRACTION * mean_burst)
     made = 0
@@ -298,7 +298,7 @@ def _requests(
         for number in range(together):
             assert flight.planner is not None
             faults = [*PlannerFault]
-            faults.remove(PlannerFault.KILLED)  # it would answer nothing any more
+            faults.remove(PlannerFault.KILLED)  # a killed planner would not answer any further request
             flight.planner.fault = faults[chance.integers(len(faults))] if chance.random() < _FAULT_FRACTION else None
             last = number == together - 1
             pause = float(chance.exponential(apart)) if last else _BURST_PERIOD
@@ -330,7 +330,7 @@ def _drawn(chance: np.random.Generator, vehicle: SteeredVehicle, limits: Limits)
 
 
 def _end(vehicle: SteeredVehicle, how: str) -> list[int]:
-    """End a flight; return the numbers of the requests that this took."""
+    """End a flight; return the numbers of the requests made to end it."""
     asked = []
     if how == "stopped and landed":
         asked.append(vehicle.request(Wish.STOP))
@@ -344,14 +344,14 @@ def _end(vehicle: SteeredVehicle, how: str) -> list[int]:
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a seed, under the limits of this folder."""
+    """Return one case per seed, under the limits of this folder."""
     seeds = range(settings.seed, settings.seed + settings.flights)
     measure = partial(fly_steered, limits=limits_for(Path()), requests=settings.requests, seconds=settings.seconds)
     return Work({str(seed): seed for seed in seeds}, measure, SteeredFlight)
 
 
 def tables(settings: Settings, rows: list[SteeredFlight]) -> Iterator[Table]:
-    """Yield what became of requests and what was streamed, by the planner's time, and the flights that went wrong."""
+    """Yield the outcomes of requests and the verdicts on setpoints, by planning time, and the failed flights."""
     flights, bad = sorted(rows, key=attrgetter("planning")), [row for row in rows if row.bad]
     requests, hours = sum(row.requests for row in rows), sum(row.hours for row in rows)
     title = f"{requests} random requests in {hours:.2f} h of flight"

@@ -1,8 +1,8 @@
-"""Stop from full speed, straight on, within several times: what that asks of the vehicle, and what refuses it.
+"""Stop from full speed, straight on, within several durations: demands on the vehicle, and reasons for refusal.
 
-The vehicle flies along the longest side of the room, and stops where it flies at a constant speed. From there every
-duration is tried that a request to stop tries, and shorter ones. Beside them stands the hardest braking of the fastest
-plan along that side, which keeps every limit of plans.
+The vehicle flies along the longest side of the room, and stops where its speed is constant. The study tries every
+duration that a request to stop tries, and shorter ones. For comparison, it measures how the fastest plan along that
+side brakes, which keeps every limit of plans.
 """
 
 import math
@@ -31,21 +31,21 @@ from studies.runner.options import option
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, besides those that a request tries
+SHORTER = (0.36, 0.4, 0.42, 0.43, 0.44)  # s, in addition to those that a request tries
 LONGEST = 0.6  # s
 PLAN = "the fastest plan"
-_FROM_WALLS = 0.5  # m beyond the margin
-_FINE = 300  # intervals of a grid that brakes as late as it may
-_FULL = 0.99  # of the highest speed: from there on a plan brakes
-_NEXT = np.array([1])  # row of a motion
+_FROM_WALLS = 0.5  # m from the margin
+_FINE = 300  # grid intervals, enough to brake as late as possible
+_FULL = 0.99  # fraction of the highest speed below which a plan brakes
+_NEXT = np.array([1])  # row of a motion: its next setpoint
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which stops are tried."""
+    """The stops to try."""
 
     durations: tuple[float, ...] = option(
-        tuple(sorted({*SHORTER, *(each for each in STOPS if each <= LONGEST)})), "Of a stop, s.", least=0.1
+        tuple(sorted({*SHORTER, *(each for each in STOPS if each <= LONGEST)})), "Duration of a stop, s.", least=0.1
     )
 
 
@@ -54,10 +54,10 @@ class Braking:
     """One way to come to rest from full speed."""
 
     what: str  # a stop, or the plan
-    speed: float  # m/s, before
+    speed: float  # m/s, at its beginning
     duration: float  # s
     distance: float  # m, of the setpoints
-    flown: float  # m, the farthest that the vehicle comes from where they begin to brake; NaN where it is refused
+    flown: float  # m, farthest distance of the vehicle from where the setpoints begin to brake; NaN if refused
     acceleration: float  # m/s²
     tilt: float  # °
     turning: float  # rad/s²
@@ -78,14 +78,14 @@ PLAN_COLUMNS = (Column("speed", "from", "m/s", ".2f"), _DISTANCE, _FLOWN, _DURAT
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a stop, and one for the fastest plan. Raises a CfplanError where no flight can be planned."""
+    """Return one case per stop, and one for the fastest plan. Raises a CfplanError if no flight can be planned."""
     limits = limits_for(Path())
     cases: dict[str, float | None] = {PLAN: None} | {f"{each:g} s": each for each in settings.durations}
     return Work(cases, partial(measure, held=_straight_flight(limits), limits=limits), Braking)
 
 
 def measure(duration: float | None, held: HeldFlight, limits: Limits) -> Braking:
-    """Stop what is held within a duration, s, from full speed; None: brake as the fastest plan does."""
+    """Stop a held flight from full speed within a duration, s; None: brake as the fastest plan does."""
     return _plan(limits) if duration is None else _stop(held, duration, limits)
 
 
@@ -115,9 +115,9 @@ def _stop(held: HeldFlight, duration: float, limits: Limits) -> Braking:
 
 
 def _plan(limits: Limits) -> Braking:
-    """Return the end of the fastest plan along that side, from where it has all but its highest speed.
+    """Return the braking of the fastest plan along that side, from where it last has nearly its highest speed.
 
-    Its waypoints are a metre apart, so that its path leaves the speed free nearly until the end.
+    Waypoints a metre apart give a path that does not limit the speed until shortly before its end.
     """
     first, last = _ends(limits)
     path = min_snap(np.linspace(first, last, 1 + round(float(np.linalg.norm(last - first)))))
@@ -143,7 +143,7 @@ def _plan(limits: Limits) -> Braking:
 
 
 def _ends(limits: Limits) -> NDArray:
-    """Return (2, 3) m: both ends of a line along the longest side of the room, through its middle."""
+    """Return the ends, (2, 3) m, of a line through the middle of the room along its longest side."""
     space = limits.space
     low, high = np.array(space.low), np.array(space.high)
     along = int(np.argmax((high - low)[:2]))
@@ -167,9 +167,9 @@ def _at_full_speed(held: HeldFlight) -> int:
 
 
 def _flown(payloads: NDArray, brakes: int, held: HeldFlight, number: int, limits: Limits) -> float:
-    """Return how far, m, the vehicle comes from the place of the one of the payloads at which it begins to brake.
+    """Return the farthest distance, m, of the vehicle from payload number `brakes`, where braking begins.
 
-    They replace what is held from setpoint `number` on.
+    The payloads replace the held setpoints from `number` on.
     """
     loop = fly_on(payloads, limits.airframe, as_believed(snapshots_at(held, number), limits))
     ahead = loop.position[loop.time >= brakes / RATE] - decode(payloads).position[brakes]
@@ -181,7 +181,7 @@ def _way(places: NDArray) -> float:
 
 
 def tables(settings: Settings, rows: list[Braking]) -> Iterator[Table]:
-    """Yield the stops, and how the fastest plan brakes."""
+    """Yield the stops, and the braking of the fastest plan."""
     stops = [row for row in rows if row.what != PLAN]
     speed = f" from {stops[0].speed:.2f} m/s" if stops else ""
     yield table("stops", f"Stops{speed}, straight on", COLUMNS, stops)

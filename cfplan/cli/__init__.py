@@ -1,4 +1,4 @@
-"""The command line: one small file a command, wiring only. Heavy packages are imported inside the commands."""
+"""The command line: one small file per command, wiring only. Heavy packages are imported inside the commands."""
 
 import gc
 import signal
@@ -30,7 +30,7 @@ EPILOG = """\b
 Examples:
   cfplan init --room 4x6x2.5               write a safety.yaml and a first path for this room
   cfplan fly flights/figure8.yaml          fly the virtual Crazyflie
-  cfplan check flights/circle.yaml         is the plan within every limit?
+  cfplan check flights/circle.yaml         check the plan against every limit
   cfplan replay records/<flight>           look at a flight in rerun
 
 \b
@@ -51,10 +51,10 @@ def _print_version(context: click.Context, _: click.Parameter, asked: bool) -> N
 
 
 class _Commands(click.Group):
-    """Lists the commands in the order in which somebody new meets them."""
+    """A group that lists the commands in the order in which a new user needs them."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return their names."""
+        """Return the names of the commands, in that order."""
         return list(self.commands)
 
 
@@ -82,9 +82,9 @@ for command in COMMANDS:
 
 
 def main() -> None:
-    """Run the command line as a process: the garbage collector looks less often, and not at all at the end.
+    """Run the command line as a process, with rarer garbage collection, and none at exit.
 
-    Walking through the thousands of objects that imports make is a third of a short command's time.
+    Collecting the thousands of objects that imports create takes a third of a short command's time.
     """
     gc.set_threshold(50_000, 20, 20)
     try:
@@ -101,7 +101,7 @@ def run_command() -> None:
 
 
 def _exit_code() -> int:
-    """Run a command and return the exit code; a user's mistake ends in one line, never in a traceback."""
+    """Run a command and return the exit code; a user's mistake is reported in one line, without a traceback."""
     try:
         result = cfplan.main(prog_name="cfplan", standalone_mode=False)
     except click.exceptions.Exit as ending:
@@ -112,7 +112,7 @@ def _exit_code() -> int:
     except (click.Abort, KeyboardInterrupt):
         print("stopped", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # the reader of our output went away, as `| head` does
+    except BrokenPipeError:  # the reader of the output has exited, as `| head` does
         sys.stderr.close()
         return 0
     except CfplanError as error:

@@ -1,4 +1,4 @@
-"""`cfplan bench`: the planners compared on one's own paths."""
+"""`cfplan bench`: compare planners on the user's paths."""
 
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,19 @@ TITLES = ["path", "planner", "flight", "against the fastest", "planning", "worst
 
 
 @click.command(
-    short_help="The planners compared on your paths.",
+    short_help="Compare planners on your paths.",
     epilog="Example: cfplan bench flights/slalom.yaml --planner expert --planner toppquad",
 )
 @click.argument("path_files", metavar="PATH...", type=click.Path(path_type=Path), nargs=-1, required=True)
-@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Limits; else the nearest safety.yaml.")
+@click.option(
+    "--safety", "safety_file", type=click.Path(path_type=Path), help="Limits.  [default: the nearest safety.yaml]"
+)
 @click.option("--planner", "planners", multiple=True, help="Planner to compare; repeatable.  [default: all]")
 @options.as_json
 def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tuple[str, ...], as_json: bool) -> None:
-    """Plan each PATH by each planner and compare their certified flights and planning times.
+    """Plan each PATH with each planner, and compare certified flights and planning times.
 
-    Each planner plans a path twice, and the second time counts: the first one loads machine code.
+    Each planner plans a path twice; only the second run is timed, as the first one loads machine code.
     """
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_files[0], steps, compile_to=Stage.PLAN)
@@ -50,7 +52,7 @@ def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tupl
 
 
 def _row(path_file: Any, planner: str, limits: Any) -> dict[str, Any]:
-    """Return what became of one path by one planner; duration, s, is None where the path was refused."""
+    """Plan one path with one planner and return the row; duration, s, is None if the path was refused."""
     from cfplan.planning.plan import plan
 
     row: dict[str, Any] = {"path": path_file.name, "planner": planner, "duration": None, "refused": ""}

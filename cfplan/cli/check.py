@@ -13,7 +13,7 @@ from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
-    short_help="The certificate of a path, of a plan or of a record.",
+    short_help="Certify a path, a plan or a record.",
     epilog="""\b
 Examples:
   cfplan check flights/circle.yaml
@@ -23,10 +23,10 @@ Examples:
 @options.planning
 @options.as_json
 def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> int:
-    """Check every limit along a path's plan, or along a plan file's, and the bytes that would fly it.
+    """Check every limit along the plan of a path or of a plan file, and the setpoint packets that would fly it.
 
-    Of a record's folder: certify again everything that was ever committed in that flight, under its limits of that day,
-    and that what was streamed is what was committed. Exit code 4 where a limit is exceeded, or that is not so.
+    For a record's folder: certify again everything that was committed in that flight, under the limits in the record,
+    and check that the setpoints sent are those committed. Exit code 4 if a limit is exceeded or a setpoint differs.
     """
     steps = Steps(as_json=as_json)
     if path_or_plan.is_dir():

@@ -1,4 +1,4 @@
-"""The confirmation that is asked for before hardware flies."""
+"""The confirmation prompt before hardware flies."""
 
 import json
 import re
@@ -16,13 +16,13 @@ from cfplan.steering.starting_vehicle import SIMULATED
 if TYPE_CHECKING:
     from cfplan.cli.recorded_flight import Prepared
 
-FIRST_SPEED = 0.3  # factor on the speed at which a path should be flown first
+FIRST_SPEED = 0.3  # speed factor at which a path should be flown first
 
 
 def confirmed(prepared: "Prepared", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
-    """Return whether to fly: always with a virtual vehicle or --yes, otherwise what the person answers.
+    """Return whether to fly: always for a virtual vehicle or with --yes, otherwise as the user answers.
 
-    Raises InputError where standard input is not a terminal.
+    Raises InputError if standard input is not a terminal.
     """
     if yes or uri.startswith(SIMULATED):
         return True
@@ -38,7 +38,7 @@ def confirmed(prepared: "Prepared", uri: str, records: Path, *, yes: bool, speed
 
 
 def describe(prepared: "Prepared", uri: str) -> str:
-    """Say how long, how fast and where it will fly, how to end it, and where link loss would end it."""
+    """Describe how long, how fast and where the vehicle will fly, how to end the flight, and where link loss would."""
     import numpy as np
 
     from cfplan.flight.setpoints.packets import decode
@@ -65,7 +65,7 @@ def describe(prepared: "Prepared", uri: str) -> str:
 
 
 def flown_before(name: str, records: Path) -> bool:
-    """Return whether a record says that a path of this name was flown to its end on hardware."""
+    """Return whether there is a record of a complete flight on hardware along a path of this name."""
     from cfplan.recording.record import SUMMARY_FILE
 
     for file in records.glob(f"*/{SUMMARY_FILE}"):

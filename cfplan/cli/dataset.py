@@ -1,4 +1,4 @@
-"""`cfplan dataset`: labelled paths for training."""
+"""`cfplan dataset`: make and inspect datasets of labelled paths."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from cfplan.learning.dataset_spec import DatasetSpec
 
 
-@click.group(short_help="Labelled paths for training.")
+@click.group(short_help="Make and inspect labelled paths for training.")
 def dataset() -> None:
-    """Make datasets of paths labelled by the expert or TOPPQuad, and look into them."""
+    """Make and inspect datasets of paths labelled by the expert or TOPPQuad."""
 
 
 def _boxes(_: click.Context, __: click.Parameter, texts: tuple[str, ...]) -> tuple[tuple[float, ...], ...]:
@@ -46,7 +46,7 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
 
 @dataset.command(epilog="Example: cfplan dataset make datasets/any --count 50000 --workers 2")
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--count", type=int, required=True, help="Clean paths.")
+@click.option("--count", type=int, required=True, help="Number of clean paths.")
 @click.option(
     "--limits",
     default="drawn",
@@ -60,9 +60,11 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     "boxes",
     callback=_boxes,
     multiple=True,
-    help="Draw waypoints in a box of these sides, m, as 4.5x8x2, instead of paths of all families; several take turns.",
+    help="Sides of a box to draw waypoints in, m, e.g. 4.5x8x2, instead of paths of all families; repeatable.",
 )
-@click.option("--waypoints", callback=_range, default="3-6", show_default=True, help="Least and most a path.")
+@click.option(
+    "--waypoints", callback=_range, default="3-6", show_default=True, help="Least and greatest number of waypoints."
+)
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
 @click.option("--yaw", type=click.Choice(["any", "fixed", "tangent", "free"]), default="any", show_default=True)
 @click.option("--epsilon", type=float, default=0.0, help="Perturb copies by at most this at every node, m.")
@@ -75,15 +77,19 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     help="Solve each copy, or keep the clean path's label.",
 )
 @click.option(
-    "--planner", type=click.Choice(["expert", "toppquad"]), default="expert", show_default=True, help="That labels."
+    "--planner",
+    type=click.Choice(["expert", "toppquad"]),
+    default="expert",
+    show_default=True,
+    help="Planner that computes the labels.",
 )
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine.")
 @click.option("--scheduler", help="Label on a Dask cluster instead: tcp://host:port.")
 @options.as_json
 def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **what: Any) -> None:
-    """Make the dataset DIR, or what is still missing of it.
+    """Make the dataset DIR, or complete it.
 
-    The same options give the same rows with any number of workers; solves that fail are rows with a reason.
+    The same options give the same rows with any number of workers; a failed solve is a row with its reason.
     """
     from cfplan.learning.dataset import make_dataset
 
@@ -104,7 +110,7 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
 
 
 def _spec(what: dict[str, Any]) -> "DatasetSpec":
-    """Return the spec that the options make."""
+    """Return the dataset's spec from the options."""
     from cfplan.geometry.path_families import USUAL
     from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset_spec import DRAWN, GIVEN, DatasetSpec, Labeller, Relabel
@@ -130,7 +136,7 @@ def _spec(what: dict[str, Any]) -> "DatasetSpec":
 
 
 def _progress(as_json: bool) -> "Progress":
-    """Return a bar with rows a second and the time left."""
+    """Return a progress bar with rows per second and the time left."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,

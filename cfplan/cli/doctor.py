@@ -1,4 +1,4 @@
-"""`cfplan doctor`: checks that everything that a flight needs is installed."""
+"""`cfplan doctor`: check that everything that a flight needs is installed."""
 
 import logging
 import os
@@ -28,13 +28,13 @@ OPTIONAL = {
 }
 
 
-@click.command(short_help="Versions, packages, machine code, radio.", epilog="Example: cfplan doctor --json")
-@click.option("--warm-up", "warm", is_flag=True, help="Compile everything that flights need, on all processors, first.")
-@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml; else the nearest above.")
-@click.option("--uri", help="A vehicle: what preflight would say of its firmware and settings. Nothing is changed.")
+@click.command(short_help="Check versions, packages, machine code and radio.", epilog="Example: cfplan doctor --json")
+@click.option("--warm-up", "warm", is_flag=True, help="First compile everything that flights need, on all processors.")
+@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml.  [default: the nearest]")
+@click.option("--uri", help="Vehicle whose firmware and settings to check as preflight does; nothing is changed.")
 @options.as_json
 def doctor(warm: bool, safety_file: Path | None, uri: str | None, as_json: bool) -> int:
-    """Show versions, packages, compiled functions and the radio, and what is missing."""
+    """Show versions, packages, compiled functions and the radio, and report what is missing."""
     if warm:
         from cfplan.cli.warm_up import warm_up
 
@@ -89,7 +89,7 @@ def _optional(name: str) -> dict[str, str]:
 
 
 def _machine_code() -> dict[str, str]:
-    """Check whether compiled functions are kept for the next start."""
+    """Check whether compiled functions can be cached for the next start."""
     from cfplan.machine_code import cache_folder, kept
 
     if not kept():
@@ -121,14 +121,14 @@ def _radio() -> dict[str, str]:
 
 
 def _vehicle(uri: str, safety_file: Path | None) -> list[dict[str, str]]:
-    """Return what preflight would say of a vehicle's firmware and settings. Raises LinkError, InputError."""
+    """Return preflight's checks of a vehicle's firmware and settings. Raises LinkError, InputError."""
     from cfplan.flight.pilot.vehicle_survey import survey_vehicle
     from cfplan.flight.radio.connection import connect
     from cfplan.flight.radio.uri import check_vehicle_uri
     from cfplan.safety.limits_file import load_limits
 
     check_vehicle_uri(uri)
-    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its tracebacks would stand above the one line that says it
+    logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its tracebacks would hide the one-line error
     limits = load_limits(options.find_safety_file(safety_file, Path.cwd()))
     with ExitStack() as opened:
         drivers: list[type] = []

@@ -1,4 +1,4 @@
-"""`cfplan export`: a certified plan in the formats of other tools."""
+"""`cfplan export`: write a certified plan in the formats of other tools."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ _FORMS = ("crazyswarm", "memory", "compressed", "samples")
 
 
 @click.command(
-    short_help="A certified plan for other tools.",
+    short_help="Write a certified plan for other tools.",
     epilog="""\b
 Examples:
   cfplan export flights/circle.yaml --to crazyswarm -o circle.csv
@@ -28,19 +28,21 @@ Examples:
     "form",
     required=True,
     type=click.Choice(_FORMS),
-    help="A polynomial CSV; the vehicle's trajectory memory, compressed where need be or always; or a CSV of states.",
+    help="Polynomial CSV; the vehicle's trajectory memory, compressed if necessary or always; or a CSV of states.",
 )
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="Write this file.")
-@click.option("--plain", is_flag=True, help="The plan's own motion, without what makes the firmware fly it.")
-@click.option("--pieces", type=click.IntRange(1, 255), help="Polynomials, at most.  [default: 31, as a vehicle holds]")
-@click.option("--rate", type=click.FloatRange(1, 1000), default=100.0, show_default=True, help="Hz, of samples.")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write.")
+@click.option("--plain", is_flag=True, help="The plan's motion alone, without corrections for the firmware.")
+@click.option(
+    "--pieces", type=click.IntRange(1, 255), help="Maximum number of pieces.  [default: 31, as a vehicle holds]"
+)
+@click.option("--rate", type=click.FloatRange(1, 1000), default=100.0, show_default=True, help="Rate of samples, Hz.")
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @options.as_json
 def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path, as_json: bool, **rest: Any) -> None:
-    """Write a plan for other tools, certified as they will read it.
+    """Write a plan for other tools, certified in the form that they read.
 
-    Polynomials stay within 2 cm of the plan and within every limit; where they cannot, the whole is slowed. They are
-    flown in the simulator as the vehicle's own commander flies them.
+    Polynomials stay within 2 cm of the plan and within every limit; if they cannot, the entire flight is slowed down.
+    The simulator flies them as the vehicle's own commander would.
     """
     plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
     _check(form, output, force, pieces)
@@ -73,7 +75,7 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
 
 
 def _check(form: str, output: Path, force: bool, pieces: int | None) -> None:
-    """Raise InputError, before anything is planned, where the file could not be written."""
+    """Raise InputError, before anything is planned, if the file could not be written."""
     suffix = ".bin" if form in ("memory", "compressed") else ".csv"
     if output.suffix != suffix:
         raise InputError(
@@ -83,6 +85,6 @@ def _check(form: str, output: Path, force: bool, pieces: int | None) -> None:
     if pieces is not None and form != "crazyswarm" and pieces > 31:
         raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
     if output.exists() and not force:
-        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")

@@ -1,4 +1,4 @@
-"""The flight on the terminal while it goes on: a line a phase, a bar along the path, and the keys that end it."""
+"""Live progress of a flight on the terminal: a line per phase, a bar along the path, and the keys that end it."""
 
 import contextlib
 import math
@@ -25,13 +25,13 @@ from cfplan.numbers import coordinates
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-_NOTES = 4.0  # s between lines within a phase, where there is no bar
+_NOTES = 4.0  # s between lines within a phase, without a bar
 KEYS = "space lands · Esc cuts the motors · Ctrl-C lands, twice cuts"
-SIGNALS_ALONE = "Ctrl-C lands, twice cuts the motors"  # where standard input is no terminal
+SIGNALS_ALONE = "Ctrl-C lands, twice cuts the motors"  # if standard input is not a terminal
 
 
 class FlightProgress:
-    """Shows telemetry: on a terminal a bar moves; elsewhere lines say the phase, and now and then how far it is."""
+    """Shows telemetry: on a terminal as a bar, elsewhere as lines with phase and, every few seconds, progress."""
 
     def __init__(self, *, duration: float, steps: Steps, clock: Clock = REAL_CLOCK):
         from rich.console import Console
@@ -62,7 +62,7 @@ class FlightProgress:
         self._pose: PoseReceived | None = None
         self._battery: float | None = None  # V
         self.heard_vehicle = False
-        self._phase, self._noted = "", math.inf  # the phase, and when a line last said how far it is, s
+        self._phase, self._noted = "", math.inf  # the phase, and when its progress was last printed, s
         self._entered = math.inf  # s
         self._clock, self._began = clock, clock.now()
 
@@ -77,7 +77,7 @@ class FlightProgress:
             self._bar.stop()
 
     def show(self, message: Telemetry) -> None:
-        """Take a message, and show it. A terminal that has closed is no reason to land."""
+        """Show a message. A closed terminal does not end the flight."""
         with contextlib.suppress(OSError):
             self._show(message)
 
@@ -98,13 +98,13 @@ class FlightProgress:
 
     def _enter(self, message: PhaseEntered) -> None:
         elapsed = message.time - self._began
-        if message.phase is Phase.ARM and self._bar.disable:  # there is no bar, under which they stand else
+        if message.phase is Phase.ARM and self._bar.disable:  # without a bar, which otherwise shows the keys
             self._bar.console.print(f"  {self._keys}", highlight=False)
         self._bar.console.print(f"  {elapsed:6.2f} s  {message.phase}", highlight=False)
         self._phase, self._entered, self._noted = str(message.phase), message.time, message.time
         streaming = message.phase is Phase.STREAM
         self._first_index_time = message.time if streaming else None
-        # without a total the bar only shows that something goes on
+        # without a total the bar only pulses
         self._bar.reset(self._task, total=self._duration if streaming else None, description=str(message.phase))
 
     def _draw(self, now: float) -> None:

@@ -1,4 +1,4 @@
-"""The flights in a folder of records, as a list."""
+"""List the flights in a folder of records."""
 
 import json
 import shlex
@@ -15,14 +15,14 @@ _UNKNOWN = "–"
 
 
 def flights_in(folder: Path) -> list[Path]:
-    """Return the records right in a folder, the latest last; none where it is no folder or a record itself."""
+    """Return the records directly in a folder, the latest last; none if it is not a folder or is a record itself."""
     if not folder.is_dir() or (folder / FLIGHT_FILE).exists():
         return []
     return sorted(file.parent for file in folder.glob(f"*/{FLIGHT_FILE}"))
 
 
 def print_flights(records: list[Path], *, as_json: bool) -> None:
-    """Print a row for each flight, from its summary, and how to look at the last one."""
+    """Print a row for each flight, from its summary, and the command that replays the last one."""
     if as_json:
         print_json({"records": [{"record": str(record), **_summary(record)} for record in records]})
         return

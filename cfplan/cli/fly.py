@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from cfplan.cli.recorded_flight import Prepared, RecordedFlight
 
-BUSY = 0.02  # s by which a setpoint is sent late only where the computer does other things
+BUSY = 0.02  # s; setpoints are later than this only if the computer is busy
 
 
 @click.command(
@@ -37,32 +37,32 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     "--waypoints",
     "lines",
     metavar="-|unix:PATH",
-    help="Instead of a path: fly waypoints read in flight, one x y z a line, from standard input (-) or from clients "
-    "of a Unix socket, as unix:waypoints.sock.",
+    help="Instead of a path: fly waypoints read in flight, one x y z per line, from standard input (-) or from clients "
+    "of a Unix socket, e.g. unix:waypoints.sock.",
 )
 @click.option(
     "--on-board",
     is_flag=True,
-    help="Upload the flight as polynomials for the vehicle's own commander to fly: nothing but poses is streamed.",
+    help="Upload the flight as polynomials for the vehicle's own commander; only poses are streamed.",
 )
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
     "--mocap",
     "mocap_uri",
-    help="The vehicle in motion capture, as vicon://192.168.1.2/cf1. sim:// has poses already; "
-    "vicon://lab/cf1 takes them through a virtual Vicon.",
+    help="The vehicle in motion capture, e.g. vicon://192.168.1.2/cf1. sim:// has poses already; "
+    "vicon://lab/cf1 sends them through a virtual Vicon.",
 )
 @click.option(
     "--records",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("records"),
     show_default=True,
-    help="Folder in which the flight's record is written, as a new folder.",
+    help="Folder for the flight's record, which is a new folder in it.",
 )
-@click.option("--live", is_flag=True, help="Show the flight in rerun while it goes on.")
+@click.option("--live", is_flag=True, help="Show the flight live in rerun.")
 @click.option(
     "--mavlink",
-    help="Ground station that watches the flight and may stop it, where it listens, as udp:127.0.0.1:14550.",
+    help="Address of a ground station that may watch and stop the flight, e.g. udp:127.0.0.1:14550.",
 )
 @click.option("--yes", is_flag=True, help="Do not ask before hardware flies.")
 @options.as_json
@@ -92,7 +92,7 @@ def fly(
         return _steer(path_or_plan, lines, on_board, safety_file, uri, mocap_uri, records, watched, yes, as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
-    with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # starts while the flight is prepared
+    with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
@@ -109,7 +109,7 @@ def fly(
 
 
 def _preparation(on_board: bool) -> "Callable[..., Prepared]":
-    """Return what prepares a flight by setpoints, or on board."""
+    """Return the function that prepares a streamed flight, or one on board."""
     if on_board:
         from cfplan.preparation.on_board_flight import prepare_on_board_flight
 
@@ -153,14 +153,14 @@ def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) 
             click.echo("the deviation grows with speed: fly flights/identify.yaml, then `cfplan identify` its record")
     hint = why_late(outcome.exit_code, summary) or outcome.hint
     reason = f"{outcome.reason} (hint: {hint})" if hint else outcome.reason
-    if outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:  # as asked: no error
+    if outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:  # as requested: not an error
         click.echo(f"{styled('ended:', 'yellow')} {reason}", err=True)
     elif outcome.exit_code is not ExitCode.OK:
         click.echo(f"{styled('error:', 'red')} {reason}", err=True)
 
 
 def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
-    """Return the hint that the computer itself was busy, where a safety rule ended a flight and setpoints were late."""
+    """Return the hint that the computer was busy, if a safety rule ended the flight and setpoints were late."""
     late = summary["lateness_max"]
     if exit_code is not ExitCode.ENDED_BY_SAFETY or late is None or late < BUSY:
         return ""
@@ -171,7 +171,7 @@ def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
 
 
 def _rows(prepared: "Prepared", flown: "RecordedFlight") -> list[tuple[str, str]]:
-    """Return the verdicts of preflight and dry run, and what `cfplan report` says of the record too."""
+    """Return rows with the verdicts of preflight and dry run, and the figures that `cfplan report` shows too."""
     from cfplan.recording.summary import summarise, summary_rows
 
     outcome, program = flown.outcome, prepared.mission.on_board

@@ -1,4 +1,4 @@
-"""`cfplan fly --waypoints`: the path comes a line at a time, while the vehicle flies."""
+"""`cfplan fly --waypoints`: read the path line by line while the vehicle flies."""
 
 import sys
 from contextlib import ExitStack, suppress
@@ -26,7 +26,7 @@ NAME = "waypoints"  # of the flight, in its record
 
 
 class _Watchers:
-    """The live view and the ground station of a flight, which open with its record."""
+    """The live view and the ground station of a flight, opened together with its record."""
 
     def __init__(self, watched: "Watched", stack: ExitStack):
         self._watched, self._stack = watched, stack
@@ -55,13 +55,13 @@ def fly_waypoints(
     """Take off, fly the requests in lines of standard input or of a Unix socket, land, and return the exit code."""
     steps = Steps(as_json=as_json)
     if not yes and not uri.startswith(SIMULATED):
-        raise InputError("hardware takes off at once", where=uri, hint="--yes, once nobody stands in the room")
+        raise InputError("hardware takes off at once", where=uri, hint="--yes, once the room is clear of people")
     limits = options.read_limits(safety_file, Path.cwd(), steps, compile_to=Stage.FLIGHT)
     with steps.waiting("loading planners and simulator"):
         from cfplan.steering.connect import connect
         from cfplan.steering.waypoint_lines import STANDARD_INPUT, opened_lines, refuse_rest, steer_by_lines
     answers: list[str] = []
-    typed = place == STANDARD_INPUT and sys.stdin.isatty()  # the lines, so keys are none
+    typed = place == STANDARD_INPUT and sys.stdin.isatty()  # lines are typed, so single keys are not read
 
     def reply(text: str) -> None:
         answers.append(text)
@@ -74,7 +74,7 @@ def fly_waypoints(
             on_step=steps, on_record=watchers.open, more_orders=lambda: chain(lines.orders(), watchers.orders()),
         )  # fmt: skip
         stack.callback(refuse_rest, lines)
-        with suppress(FlightEndedError), vehicle:  # its outcome says why
+        with suppress(FlightEndedError), vehicle:  # the outcome has the reason
             vehicle.take_off()
             steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
             steer_by_lines(vehicle, lines)

@@ -1,4 +1,4 @@
-"""`cfplan identify`: what flights say about the vehicle."""
+"""`cfplan identify`: estimate the vehicle's parameters from its flights."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,7 @@ AIRFRAME_FILE = Path("airframe.yaml")
 
 
 @click.command(
-    short_help="Mass, thrust, lag, drag and latencies from flights.",
+    short_help="Estimate mass, thrust, lag, drag and latencies from flights.",
     epilog="""\b
 Examples:
   cfplan fly flights/identify.yaml
@@ -24,7 +24,7 @@ Examples:
 )
 @click.argument("records", metavar="RECORD...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option(
-    "--mass", type=float, help="kg, as weighed with the battery; flying tells only the ratios of thrust and drag to it."
+    "--mass", type=float, help="Mass with battery, kg; flights only determine the ratios of thrust and drag to it."
 )
 @click.option(
     "-o",
@@ -32,12 +32,12 @@ Examples:
     type=click.Path(path_type=Path, dir_okay=False),
     default=AIRFRAME_FILE,
     show_default=True,
-    help="Where to write the airframe.",
+    help="Airframe file to write.",
 )
-@click.option("--force", is_flag=True, help="Overwrite it.")
+@click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
 def identify(records: tuple[Path, ...], mass: float | None, output: Path, force: bool, as_json: bool) -> None:
-    """Identify the vehicle that flew one RECORD or more: each figure with its standard uncertainty.
+    """Identify the vehicle that flew one or more RECORDs: each figure with its standard uncertainty.
 
     Writes an airframe file, and prints the lines for safety.yaml.
     """
@@ -48,16 +48,16 @@ def identify(records: tuple[Path, ...], mass: float | None, output: Path, force:
     steps, read = Steps(as_json=as_json), []
     check_target(output, overwrite=force)
     for place in records:
-        with steps.step("read") as said:
+        with steps.step("read") as results:
             read.append(read_record(place))
-            said.append(f"{read[-1].header.name}, {read[-1].duration:.1f} s")
-            said.extend(["ends early"] if read[-1].truncated else [])
-    with steps.step("fit") as said:
+            results.append(f"{read[-1].header.name}, {read[-1].duration:.1f} s")
+            results.extend(["ends early"] if read[-1].truncated else [])
+    with steps.step("fit") as results:
         found = fit(read, mass=mass)
-        said.append(f"{1e3 * found.misfit:.2f} mm rms unexplained, over predictions of a second")
-    with steps.step("airframe") as said:
+        results.append(f"{1e3 * found.misfit:.2f} mm rms unexplained, over predictions of a second")
+    with steps.step("airframe") as results:
         write_airframe(found.airframe, output, overwrite=force)
-        said.append(str(output))
+        results.append(str(output))
     _print(found, output, safety_lines(found, output), as_json)
 
 

@@ -1,4 +1,4 @@
-"""`cfplan init`: a safety.yaml for this room, and a first path in it."""
+"""`cfplan init`: write a safety.yaml for a room, and a first path in it."""
 
 import re
 from pathlib import Path
@@ -12,12 +12,12 @@ from cfplan.errors import InputError
 _ROOM = "4.5x8x2"
 _LEAST_SIDE, _LEAST_HEIGHT, _MOST_SIDE, _MOST_HEIGHT = 1.5, 1.2, 60.0, 30.0  # m; setpoints hold 32 m
 _CLIMB = 0.5  # m, at most
-_FILL = 0.6  # of the room within the margin, that the first path fills: link loss needs the rest
+_FILL = 0.6  # fraction of the room within the margin that the first path fills; link loss needs the rest
 _PATH_FILE, _AIRFRAME_FILE = "first.yaml", "airframe.yaml"
 
 
 @click.command(
-    short_help="A safety.yaml and a first path for this room.",
+    short_help="Write a safety.yaml and a first path for a room.",
     epilog="""\b
 Examples:
   cfplan init --room 4x6x2.5                        here
@@ -29,13 +29,13 @@ Examples:
     "--room",
     default=_ROOM,
     show_default=True,
-    help="Length along x, y and z, m; x and y have their middle at 0, the floor is z = 0.",
+    help="Size along x, y and z, m; the origin is in the middle of the floor.",
 )
-@click.option("--vehicle", default="crazyflie-2.1+", show_default=True, help="A known airframe.")
-@click.option("--mass", type=float, help="kg, as weighed with battery and markers; writes an airframe file of its own.")
+@click.option("--vehicle", default="crazyflie-2.1+", show_default=True, help="Name of a known airframe.")
+@click.option("--mass", type=float, help="Mass with battery and markers, kg; also writes an airframe file.")
 @options.as_json
 def init(folder: Path, room: str, vehicle: str, mass: float | None, as_json: bool) -> None:
-    """Write a commented safety.yaml and a first path for this room into FOLDER. Files that exist are never changed."""
+    """Write a commented safety.yaml and a first path for a room into FOLDER. Existing files are never changed."""
     from cfplan.safety.limits_file import load_limits
 
     steps = Steps(as_json=as_json)
@@ -48,11 +48,11 @@ def init(folder: Path, room: str, vehicle: str, mass: float | None, as_json: boo
     }
     for name in texts:
         if (folder / name).exists():
-            raise InputError("there is such a file already", where=str(folder / name), hint="name another folder")
-    with steps.step("write") as said:
+            raise InputError("the file already exists", where=str(folder / name), hint="name another folder")
+    with steps.step("write") as results:
         _write(folder, texts)
         load_limits(folder / options.SAFETY_FILE)
-        said.append(", ".join(str(folder / name) for name in texts))
+        results.append(", ".join(str(folder / name) for name in texts))
     steps.say(f"measure the room, correct safety.yaml, then: cfplan fly {folder / _PATH_FILE}")
     if as_json:
         print_json({"files": [str(folder / name) for name in texts]})
@@ -63,7 +63,7 @@ def _sides(text: str) -> tuple[float, float, float]:
         x, y, z = (float(side) for side in text.lower().split("x"))
     except ValueError:
         raise InputError(
-            f"{text!r} is no room", where="--room", hint=f"write length x width x height, as {_ROOM}"
+            f"{text!r} is not a room size", where="--room", hint=f"write length x width x height, as {_ROOM}"
         ) from None
     if not (min(x, y) >= _LEAST_SIDE and max(x, y) <= _MOST_SIDE and _LEAST_HEIGHT <= z <= _MOST_HEIGHT):
         raise InputError(
@@ -75,7 +75,7 @@ def _sides(text: str) -> tuple[float, float, float]:
 
 
 def _airframe(vehicle: str, mass: float | None) -> str | None:
-    """Return the text of an airframe of that mass, kg; None where the known one is to be used as it is."""
+    """Return the text of an airframe with this mass, kg; None if the known airframe is used unchanged."""
     from dataclasses import replace
 
     from cfplan.identification.airframe_yaml import airframe_text
@@ -86,7 +86,7 @@ def _airframe(vehicle: str, mass: float | None) -> str | None:
         return None
     if not 0.5 * known.mass <= mass <= 2.0 * known.mass:
         raise InputError(
-            f"{mass:g} kg is not the mass of a {vehicle}, some {known.mass:g} kg",
+            f"{mass:g} kg is implausible for a {vehicle} of about {known.mass:g} kg",
             where="--mass",
             hint="weigh it with battery and markers, and write kilograms",
         )
@@ -110,7 +110,7 @@ def _safety_text(sides: tuple[float, float, float], vehicle: str) -> str:
 
 
 def _path_text(sides: tuple[float, float, float]) -> str:
-    """Return a loop around the middle of the room, half-way up, climbing a little."""
+    """Return a path file with a loop around the middle of the room, at half its height, that climbs a little."""
     from cfplan.safety.limits_file import DEFAULTS, load_limits
 
     margin = load_limits(DEFAULTS).space.margin
@@ -127,12 +127,12 @@ waypoints:            # m, in the frame of motion capture: x, y, height
   - [{-a}, 0, {high}]
   - [0, {-b}, {low}]
 yaw: fixed            # or tangent, free, or {{mode: fixed, angle_deg: 90}}
-speed: 0.5            # share of the speed that safety.yaml allows
+speed: 0.5            # factor on the speed that safety.yaml allows
 """
 
 
 def _write(folder: Path, texts: dict[str, str]) -> None:
-    """Write the files; none that exists already, not even one that appears meanwhile. Raises InputError."""
+    """Write the files without ever overwriting one, not even one created meanwhile. Raises InputError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():

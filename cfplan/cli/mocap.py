@@ -1,4 +1,4 @@
-"""`cfplan mocap`: what motion capture sees."""
+"""`cfplan mocap`: show what motion capture sees."""
 
 import math
 from dataclasses import asdict
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="What motion capture sees.",
+    short_help="Show what motion capture sees.",
     epilog="""\b
 Examples:
   cfplan mocap vicon://192.168.1.2            every body
@@ -25,10 +25,10 @@ Examples:
   cfplan mocap qualisys://192.168.1.3         optitrack:// and vrpn:// likewise""",
 )
 @click.argument("uri")
-@click.option("--seconds", type=click.FloatRange(0.1, 86400), default=5.0, show_default=True, help="How long to look.")
+@click.option("--seconds", type=click.FloatRange(0.1, 86400), default=5.0, show_default=True, help="Time to look, s.")
 @options.as_json
 def mocap(uri: str, seconds: float, as_json: bool) -> int:
-    """Show the bodies that a motion capture system at URI sees, and how steadily its frames come."""
+    """Show the bodies that the motion capture system at URI sees, and how regularly its frames arrive."""
     from rich.console import Console
     from rich.live import Live
     from rich.text import Text
@@ -37,7 +37,7 @@ def mocap(uri: str, seconds: float, as_json: bool) -> int:
     from cfplan.flight.mocap.uri import parse_uri
 
     where = parse_uri(uri, subject_needed=False)
-    with Live(console=Console(quiet=as_json), transient=True) as screen:  # on a terminal alone
+    with Live(console=Console(quiet=as_json), transient=True) as screen:  # only drawn on a terminal
         found = survey(where, seconds, lambda so_far: screen.update(Text(_line(so_far))))
     if as_json:
         print_json({"uri": str(where), **asdict(found), "remarks": _remarks(found)})
@@ -84,7 +84,7 @@ def _announced(found: "Survey") -> str:
 
 
 def _milliseconds(seconds: float) -> str:
-    return f"{1e3 * seconds:.1f} ms" if math.isfinite(seconds) else "not told"
+    return f"{1e3 * seconds:.1f} ms" if math.isfinite(seconds) else "not reported"
 
 
 def _place(position: tuple[float, float, float] | None) -> str:

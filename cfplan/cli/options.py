@@ -48,7 +48,7 @@ def _needed(context: click.Context, parameter: click.Parameter, path: Path | Non
 
 
 def _path(name: str, check: Callable) -> Callable:
-    """Return what adds a path as an argument, and --example in its place, to a command."""
+    """Return a decorator that adds a path argument to a command, and --example as an alternative."""
     kind = click.Path(path_type=Path)
     argument = click.argument(
         name, metavar=f"[{name.removesuffix('_file').upper()}]", type=kind, required=False, callback=check
@@ -56,10 +56,10 @@ def _path(name: str, check: Callable) -> Callable:
     instead = click.option(
         "--example",
         metavar="NAME",
-        is_eager=True,  # read before the path, which it stands for
+        is_eager=True,  # processed before the path that it replaces
         expose_value=False,
         callback=_remember_example,
-        help="Instead of a path: one that comes with cfplan, as figure8.",
+        help="Instead of a path: one that comes with cfplan, e.g. figure8.",
     )
     return lambda command: instead(argument(command))
 
@@ -74,7 +74,7 @@ def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool)
 
 
 class _SpeedFactor(click.FloatRange):
-    """A share of the allowed speed, which is often taken for m/s."""
+    """A factor on the allowed speed, whose error message also explains that it is not in m/s."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         try:
@@ -88,7 +88,7 @@ _PLANNING = (
         "--safety",
         "safety_file",
         type=click.Path(path_type=Path),
-        help=f"Limits to keep; else the nearest {SAFETY_FILE} in or above this folder, or above the path file.",
+        help=f"Limits to keep.  [default: the nearest {SAFETY_FILE} in or above this folder, else above the path file]",
     ),
     click.option(
         "--planner",
@@ -99,19 +99,19 @@ _PLANNING = (
     click.option(
         "--model",
         type=click.Path(path_type=Path),
-        help="Folder of the learned planner's model; else models/ beside the limits is looked into.",
+        help="Folder of the learned planner's model.  [default: search models/ beside the limits]",
     ),
-    click.option("--nodes", type=click.IntRange(4), help="Grid intervals; else chosen from the path's length."),
+    click.option("--nodes", type=click.IntRange(4), help="Grid intervals.  [default: by the path's length]"),
     click.option(
         "--budget",
         type=click.FloatRange(0, min_open=True),
-        help="Longest planning time, s, without compiling.  [default: 5, and 0.02 a metre]",
+        help="Longest planning time, s, without compiling.  [default: 5, plus 0.02 per metre]",
     ),
     click.option(
         "--speed",
         "speed_factor",
         type=_SpeedFactor(0, 1, min_open=True),
-        help="Factor on the allowed speed; else the path file's, else 1.",
+        help="Factor on the allowed speed.  [default: the path file's, else 1]",
     ),
     click.option(
         "-v",
@@ -119,7 +119,7 @@ _PLANNING = (
         is_flag=True,
         expose_value=False,
         callback=_remember_verbose,
-        help="Say more of each step, as what every planner found.",
+        help="Print details of each step, e.g. the result of every planner.",
     ),
 )
 
@@ -134,7 +134,7 @@ def planning(command: Callable) -> Callable:
 def find_safety_file(given: Path | None, path_file: Path) -> Path:
     """Return the safety.yaml to use: the one given, or the nearest above the working folder or above the path file.
 
-    Raises InputError where there is none.
+    Raises InputError if there is none.
     """
     if given is not None:
         return given
@@ -149,18 +149,18 @@ def find_safety_file(given: Path | None, path_file: Path) -> Path:
 
 
 def check_place(uri: str, given: Path | None, records: Path) -> None:
-    """Raise InputError where an example would fly hardware in a room that nobody has named, or no record be kept."""
+    """Raise InputError if an example would fly hardware without --safety, or if no record could be written."""
     if _EXAMPLE in click.get_current_context().meta and not uri.startswith("sim://") and given is None:
         raise InputError(
-            "an example flies a vehicle of yours only in a room of yours",
+            "an example flies hardware only with an explicit safety.yaml",
             where=uri,
-            hint="name your safety.yaml with --safety; `cfplan init` writes one",
+            hint="name that of your room with --safety; `cfplan init` writes one",
         )
     _check_records_folder(records)
 
 
 def _check_records_folder(root: Path) -> None:
-    """Raise InputError where no record could be written under `root`, which need not exist yet."""
+    """Raise InputError if no record could be written under `root`, which need not exist yet."""
     there = root.absolute()
     while not there.exists() and there != there.parent:
         there = there.parent
@@ -177,7 +177,7 @@ def _check_records_folder(root: Path) -> None:
 
 
 def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
-    """Return the options of planning() with the folders to look for models in. Raises InputError: no such model."""
+    """Return the options of planning() with the folders of models. Raises InputError if there is no such model."""
     from cfplan.preparation.plan_flight import FlightOptions
 
     rest = {name: value for name, value in planning.items() if name != "model"}
@@ -190,9 +190,9 @@ def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path
 
 
 def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_to: "Stage | None" = None) -> "Limits":
-    """Find and read safety.yaml, once a command, as its first step; begin to compile what the command will need.
+    """Find and read safety.yaml, as the first step of a command; begin to compile the functions that it will need.
 
-    Raises InputError where that is wrong, or where there is no path file to begin with.
+    Raises InputError if safety.yaml is wrong, or there is no path file.
     """
     if not path_file.exists():
         raise InputError("no such file", where=str(path_file), hint="check the name; it is relative to this folder")

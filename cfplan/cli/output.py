@@ -1,4 +1,4 @@
-"""Output of the commands: a line a step for people, one JSON document for scripts."""
+"""Output of the commands: a line per step for people, one JSON document for scripts."""
 
 import json
 import os
@@ -18,29 +18,29 @@ from cfplan.flight.clock import REAL_CLOCK, Clock, Repeated
 from cfplan.preparation.steps import StepResults, StepState, step
 
 VERBOSE = f"{__name__}.verbose"  # in click's context: --verbose was given
-_FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a wait is shown, and between later notes
+_FIRST_NOTE, _TERMINAL_NOTES, _OTHER_NOTES = 1.0, 0.5, 4.0  # s until a note, between notes on a terminal, elsewhere
 _MARKS = {StepState.FINISHED: ("✓", "green"), StepState.WARNED: ("!", "yellow"), StepState.FAILED: ("✗", "red")}
-_NARROWEST = 30  # characters for a step's result, below which it is not wrapped
-_FILE_WIDTH = 80  # characters, of tables that go to a file or a pipe, where COLUMNS says nothing else
+_NARROWEST = 30  # characters; a step's result is not wrapped to fewer
+_FILE_WIDTH = 80  # characters, of tables written to a file or a pipe, unless COLUMNS is set
 
 
 class Steps:
-    """Prints one line a step as it ends, with the time that it took; silent where JSON is asked for.
+    """Prints one line per step when it ends, with the time that it took; silent with --json.
 
-    A step that takes longer than a second says meanwhile what is waited for and for how long: on a terminal in a line
-    that is overwritten, elsewhere in another line every few seconds.
+    While a step takes longer than a second, a note shows its name and the time passed: on a terminal in a line that is
+    overwritten, elsewhere in a new line every few seconds.
     """
 
     def __init__(self, *, as_json: bool, clock: Clock = REAL_CLOCK):
         self.as_json, self._clock = as_json, clock
         context = click.get_current_context(silent=True)
         self.verbose = bool(context and context.meta.get(VERBOSE))  # whether details of steps are shown
-        self.meanwhile: Callable[[], str] = str  # what else goes on, shown beside what is waited for
+        self.meanwhile: Callable[[], str] = str  # background work, shown in the note of a wait
         self._begun = 0.0
         self._waiting: Repeated | None = None
 
     def __call__(self, name: str, state: StepState, result: str) -> None:
-        """Show how far a step is; an OnStep."""
+        """Show the state of a step; an OnStep."""
         if self.as_json:
             return
         if state is StepState.DETAIL:
@@ -64,7 +64,7 @@ class Steps:
 
     @contextmanager
     def waiting(self, name: str) -> Iterator[None]:
-        """Say what is waited for if the block takes longer than a second; nothing is printed at its end."""
+        """Show a note if the block takes longer than a second; nothing is printed at its end."""
         self(name, StepState.BEGUN, "")
         try:
             yield
@@ -72,22 +72,22 @@ class Steps:
             self._end_waiting()
 
     def step(self, name: str) -> AbstractContextManager[StepResults]:
-        """Time a step of a command. What the block appends to the list is printed behind the step's name."""
+        """Time a step of a command. Texts that the block appends to the list are printed after the step's name."""
         return step(self, name)
 
     def failed(self, name: str, text: str) -> None:
-        """Show a step that ran to its end with the verdict no."""
+        """Print the line of a step that ran to its end with a negative verdict."""
         if not self.as_json:
             click.echo(_line(styled("✗", "red"), f"{name:<12} ", text))
 
     def say(self, text: str = "") -> None:
-        """Print a line that is no step."""
+        """Print a line that does not belong to a step."""
         if not self.as_json:
             click.echo(text)
 
 
 def _line(mark: str, head: str, result: str) -> str:
-    """Return a step's line; on a terminal that is too narrow it goes on under the result's beginning."""
+    """Return a step's line; on a narrow terminal it is wrapped with the result's indentation."""
     text = printable(result)
     room = shutil.get_terminal_size().columns - 2 - len(head)
     if sys.stdout.isatty() and len(text) > room >= _NARROWEST:
@@ -96,13 +96,13 @@ def _line(mark: str, head: str, result: str) -> str:
 
 
 def _compiling_here() -> str:
-    """Say that this process compiles, if it does; whether it can is known without loading what compiles."""
-    compiles = getattr(sys.modules.get("cfplan.machine_code"), "compiles", None)  # none while that is still loading
+    """Return a note if this process is compiling, without importing the compiler."""
+    compiles = getattr(sys.modules.get("cfplan.machine_code"), "compiles", None)  # None while the module is loading
     return "compiling, once for this machine" if compiles and compiles() else ""
 
 
 class _WaitingNote:
-    """Says again and again what is waited for."""
+    """Prints repeatedly what a command waits for."""
 
     def __init__(self, name: str, steps: Steps, clock: Clock):
         self._name, self._steps, self._clock = name, steps, clock
@@ -110,7 +110,7 @@ class _WaitingNote:
         self._calls = 0
 
     def show(self) -> float | None:
-        """Show it, but for the first time; return s until it is to be shown again."""
+        """Show the note, except on the first call; return the time until the next call, s."""
         self._calls += 1
         if self._calls == 1:
             return _FIRST_NOTE
@@ -119,7 +119,7 @@ class _WaitingNote:
             text += f" ({meanwhile})"
         try:
             click.echo(f"\r\033[K{text}" if self._on_terminal else text, nl=not self._on_terminal)
-        except BrokenPipeError:  # the reader of our output went away, as `| head` does
+        except BrokenPipeError:  # the reader of the output has exited, as `| head` does
             return None
         return _TERMINAL_NOTES if self._on_terminal else _OTHER_NOTES
 
@@ -131,13 +131,13 @@ class _WaitingNote:
 
 
 def print_json(document: Any) -> None:
-    """Print one document on standard output; numbers that are not finite become null, as JSON has no word for them."""
+    """Print one document on standard output; numbers that are not finite become null."""
     text = json.dumps(json_value(document), indent=2, ensure_ascii=False)
     click.echo(text.encode("utf-8", "backslashreplace").decode("utf-8"))  # half a surrogate pair, as JSON escapes it
 
 
 def print_error(error: CfplanError, *, as_json: bool) -> None:
-    """Print one line on standard error, and the same as JSON on standard output where that was asked for."""
+    """Print one line on standard error, and with `as_json` the same as JSON on standard output."""
     click.echo(f"{styled('error:', 'red')} {error}", err=True)
     if as_json:
         code = int(error.exit_code)
@@ -145,7 +145,7 @@ def print_error(error: CfplanError, *, as_json: bool) -> None:
 
 
 def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table: text to the left, numbers to the right, no wider than the terminal, or than 80 characters."""
+    """Print a table, numbers right-aligned, no wider than the terminal, or than 80 characters without one."""
     from rich.console import Console
 
     from cfplan.cli.tables import print_fitting
@@ -157,7 +157,7 @@ def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -
 
 
 def styled(text: str, colour: str) -> str:
-    """Return text in that colour; as it is where the environment has NO_COLOR (https://no-color.org)."""
+    """Return text in a colour, or unchanged if the environment has NO_COLOR (https://no-color.org)."""
     return text if os.environ.get("NO_COLOR") else click.style(text, fg=colour)
 
 
@@ -167,7 +167,7 @@ def on_terminal() -> bool:
 
 
 def short_path(file: Path) -> str:
-    """Return a path as it is shortest to read: from the working folder where it lies in it."""
+    """Return a path relative to the working folder if it lies in it, else unchanged."""
     try:
         return str(file.resolve().relative_to(Path.cwd()))
     except (ValueError, OSError):

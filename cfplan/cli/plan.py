@@ -1,4 +1,4 @@
-"""`cfplan plan`: from a path file to a certified trajectory."""
+"""`cfplan plan`: plan a certified trajectory for a path file."""
 
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,13 @@ from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
-    short_help="A certified trajectory for a path.", epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet"
+    short_help="Plan a certified trajectory for a path.",
+    epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet",
 )
 @options.path_file
 @options.planning
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write the plan here, as Parquet.")
-@click.option("--figure", type=click.Path(path_type=Path), help="Draw the plan in its room here: .png, .pdf or .svg.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Plan file to write, Parquet.")
+@click.option("--figure", type=click.Path(path_type=Path), help="Figure of the plan to write: .png, .pdf or .svg.")
 @click.option("--force", is_flag=True, help="Overwrite the files.")
 @options.as_json
 def plan(
@@ -58,13 +59,13 @@ def plan(
 
 
 def _compared(duration: float, bound: float, speed_factor: float) -> str:
-    """Return one line about a flight's duration and the least time of any flight at the same share of its speed, s."""
-    at_share = f" at {speed_factor:g} of full speed" if speed_factor < 1.0 else ""
-    return f"{shown(100 * (duration / bound - 1.0), '.1f')} % above {bound:.2f} s, which no flight{at_share} beats"
+    """Return one line that compares a flight's duration with the lower bound at the same speed factor, s."""
+    at_speed = f" at {speed_factor:g} of full speed" if speed_factor < 1.0 else ""
+    return f"{shown(100 * (duration / bound - 1.0), '.1f')} % above {bound:.2f} s, which no flight{at_speed} beats"
 
 
 def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:
-    """Raise InputError, before anything is planned, where a file could not be written or the plan not be read again."""
+    """Raise InputError, before anything is planned, if a file could not be written or the plan not be read again."""
     if figure is not None:
         from cfplan.planning.figure import check_figure_file
 
@@ -80,6 +81,6 @@ def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:
             hint=f"name it {output.with_suffix(PLAN_SUFFIX).name}",
         )
     if output.exists() and not force:
-        raise InputError("there is a file already", where=str(output), hint="give --force to overwrite it")
+        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")

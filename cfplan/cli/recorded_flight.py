@@ -1,4 +1,4 @@
-"""A prepared flight flown and recorded, while a terminal, a live view and a ground station watch."""
+"""Fly and record a prepared flight, shown on the terminal, in a live view and in a ground station."""
 
 import shutil
 from collections.abc import Callable
@@ -30,19 +30,19 @@ Prepared = PreparedFlight | PreparedOnBoard
 
 
 class RecordedFlight(NamedTuple):
-    """A flight that is over."""
+    """A completed flight with its record."""
 
     outcome: FlightOutcome
     record: Record
-    summary: dict[str, Any]  # as it stands in the record's folder
+    summary: dict[str, Any]  # as written to the record's folder
 
 
 def fly_and_record(
     prepared: Prepared, source: Path, records: Path, vehicle: StartingVehicle, watched: Watched, steps: Steps
 ) -> RecordedFlight:
-    """Fly, and return the outcome, the record and its summary. Without a flight no folder is left.
+    """Fly, and return the outcome, the record and its summary. Without a flight, the folder is removed.
 
-    Raises a CfplanError where the vehicle or its poses cannot be had.
+    Raises a CfplanError if the vehicle or its poses are not available.
     """
     pose_source = vehicle.poses(steps)
     folder = new_record_folder(records, prepared.planned.name)
@@ -76,7 +76,7 @@ def _fly_into(
     progress: FlightProgress,
     keyboard: Keyboard,
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
-    """Fly, and return the outcome and what failed beside the flight: (record or watching, why)."""
+    """Fly, and return the outcome and the failures of record or watchers: (which, reason)."""
     name, uri = prepared.planned.name, vehicle.uri
     save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
     header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
@@ -101,7 +101,7 @@ def _fly_into(
 
 
 def _for_all(*listeners: Callable[[Telemetry], None]) -> Callable[[Telemetry], None]:
-    """Return a listener that passes each message to all of these."""
+    """Return a listener that passes each message to all `listeners`."""
 
     def tell(message: Telemetry) -> None:
         for listener in listeners:

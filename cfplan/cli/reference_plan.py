@@ -1,4 +1,4 @@
-"""The plan that a log is laid over: as it was flown, or planned as `cfplan fly` would."""
+"""The plan that a log is compared with: as it was flown, or planned as by `cfplan fly`."""
 
 import math
 from dataclasses import replace
@@ -20,10 +20,10 @@ FAR = 1e6  # m
 def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "Reference":
     """Return the plan of a record or of a plan file as it was flown, else plan the path file as `cfplan fly` does.
 
-    Looking at a flight must not fail because of the room: a path that today's safety.yaml refuses is planned as if
-    there were no walls, and that is said.
+    Showing a flight must not fail because of the room: a path that the present safety.yaml refuses is planned without
+    walls, and a warning is printed.
 
-    Raises InputError where a file is wrong, InfeasibleError where no profile keeps the limits of motion.
+    Raises InputError if a file is wrong, InfeasibleError if no profile keeps the limits of motion.
     """
     from cfplan.preparation.compiled_calls import Stage
     from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
@@ -31,7 +31,7 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
     from cfplan.recording.record import PLAN_FILE
 
     file = source / PLAN_FILE if (source / PLAN_FILE).is_file() else source
-    if file.suffix == PLAN_SUFFIX:  # as it was planned, under the limits of that day
+    if file.suffix == PLAN_SUFFIX:  # as planned then, under the limits in the file
         from cfplan.planning.plan_file import load_plan
 
         with steps.step("plan") as results:
@@ -50,7 +50,7 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 
 
 def _without_walls(source: Path, limits: "Limits", steps: "Steps") -> "Plan":
-    """Plan a path file within the limits of motion alone. Raises InfeasibleError where no profile keeps them."""
+    """Plan a path file within the limits of motion alone. Raises InfeasibleError if no profile keeps them."""
     from cfplan.geometry.path_file import load_path_file
     from cfplan.planning.plan import plan
 

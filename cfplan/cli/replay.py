@@ -33,22 +33,25 @@ Examples:
     "--plan",
     "plan_file",
     type=click.Path(path_type=Path),
-    help="Lay the flights over this plan: a record's, a plan file, or of a path file what `cfplan fly` would plan.",
+    help="Plan to compare the flights with: of a record, a plan file, or a path file, planned as by `cfplan fly`.",
 )
 @click.option(
-    "--safety", "safety_file", type=click.Path(path_type=Path), help="Limits for planning it; found as by `cfplan fly`."
+    "--safety",
+    "safety_file",
+    type=click.Path(path_type=Path),
+    help="Limits for --plan.  [default: as for `cfplan fly`]",
 )
-@click.option("--subject", "names", multiple=True, help="Show this subject of a mocap log only; may be repeated.")
+@click.option("--subject", "names", multiple=True, help="Subject of a mocap log to show; repeatable.  [default: all]")
 @click.option(
     "--angles",
     type=click.Choice(["helical", "euler"]),
-    help="What the three angles of a Vicon CSV are where its header does not say.",
+    help="Kind of the three angles in a Vicon CSV, if its header does not say.",
 )
-@click.option("--save", type=click.Path(path_type=Path), help="Write a rerun file here instead of opening the viewer.")
-@click.option("--png", type=click.Path(path_type=Path), help="Draw the view into this picture; needs no screen.")
-@click.option("--figure", type=click.Path(path_type=Path), help="Draw a record for print here: .png, .pdf or .svg.")
-@click.option("--gif", type=click.Path(path_type=Path), help="Animate a record's flight along its path here.")
-@click.option("--at", "moment", type=float, help="s on the timeline, of the picture; else amid the path.")
+@click.option("--save", type=click.Path(path_type=Path), help="Rerun file to write instead of opening the viewer.")
+@click.option("--png", type=click.Path(path_type=Path), help="Picture of the view to write; needs no screen.")
+@click.option("--figure", type=click.Path(path_type=Path), help="Figure of a record to write: .png, .pdf or .svg.")
+@click.option("--gif", type=click.Path(path_type=Path), help="GIF to write: a record's flight along its path.")
+@click.option("--at", "moment", type=float, help="Time of the picture, s.  [default: the middle of the path]")
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
 def replay(
@@ -97,11 +100,11 @@ class Files:
     png: Path | None
     figure: Path | None  # of one record
     gif: Path | None  # likewise
-    moment: float | None  # s, of the picture
+    moment: float | None  # s on the timeline, of the picture
     force: bool
 
     def check(self, *, one_record: bool) -> None:
-        """Raise InputError where they do not go together, or a figure could not be written."""
+        """Raise InputError if the options do not go together, or a figure could not be written."""
         if self.moment is not None and (self.png is None or not abs(self.moment) < 1e6):
             raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
         from cfplan.files.whole import check_new_file
@@ -121,7 +124,7 @@ class Files:
             raise InputError("a figure is of one record", where=str(drawn), hint="name one record, without --plan")
 
     def to_json(self) -> dict[str, str | None]:
-        """Return the names of the files; null where one was not asked for."""
+        """Return the names of the files; None for those not requested."""
         files = {"rrd": self.save, "png": self.png, "figure": self.figure, "gif": self.gif}
         return {kind: str(file) if file else None for kind, file in files.items()}
 
@@ -130,14 +133,14 @@ class Files:
     ) -> None:
         """Write the files, or show the flight in the viewer."""
         if self.save is not None:
-            with steps.step("rerun file") as said:
+            with steps.step("rerun file") as results:
                 write(self.save, overwrite=self.force)
-                said.append(f"{self.save} ({_size(self.save)}); open it with: rerun {self.save}")
+                results.append(f"{self.save} ({_size(self.save)}); open it with: rerun {self.save}")
         if self.png is not None:
-            with steps.step("picture") as said:
+            with steps.step("picture") as results:
                 complaints = picture(self.png, moment=self.moment, overwrite=self.force)
-                said.append(f"{self.png} ({_size(self.png)})")
-                said.extend(complaints)
+                results.append(f"{self.png} ({_size(self.png)})")
+                results.extend(complaints)
         if self.save is None and self.png is None and self.figure is None and self.gif is None:
             with steps.step("viewer"):
                 show()
@@ -152,24 +155,24 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
     from cfplan.recording.rerun.record_view import picture, show, write_rrd
     from cfplan.recording.summary import summarise
 
-    with steps.step("read") as said:
+    with steps.step("read") as results:
         flight = read_record(place)
-        said.append(f"{flight.header.name}, {flight.duration:.1f} s, {len(flight.setpoints.time)} setpoints")
+        results.append(f"{flight.header.name}, {flight.duration:.1f} s, {len(flight.setpoints.time)} setpoints")
         if flight.truncated:
-            said.append("truncated: what follows the last whole chunk is lost")
+            results.append("truncated: data after the last complete chunk is lost")
     if files.figure is not None:
         from cfplan.planning.figure import save_figure
         from cfplan.recording.flight_figure import draw_flight
 
-        with steps.step("figure") as said:
+        with steps.step("figure") as results:
             save_figure(draw_flight(flight), files.figure, overwrite=files.force)
-            said.append(str(files.figure))
+            results.append(str(files.figure))
     if files.gif is not None:
         from cfplan.recording.animation import animate_flight, save_animation
 
-        with steps.step("animation") as said:
+        with steps.step("animation") as results:
             save_animation(animate_flight(flight), files.gif, overwrite=files.force)
-            said.append(f"{files.gif} ({_size(files.gif)})")
+            results.append(f"{files.gif} ({_size(files.gif)})")
     files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
     return {"record": str(place), **(summarise(flight).to_json() if steps.as_json else {})}
 
@@ -193,27 +196,27 @@ def _replay_trials(
     from cfplan.recording.rerun.overlay_view import picture_overlay, show_overlay, write_overlay
 
     trials: list[Trial] = []
-    told: list[dict[str, Any]] = []
+    descriptions: list[dict[str, Any]] = []
     for place in flights:
-        for trial, said in _trials(place, reference, names, angles, steps):
+        for trial, description in _trials(place, reference, names, angles, steps):
             trials.append(trial)
-            told.append({"file": str(place), "name": trial.name, **said})
+            descriptions.append({"file": str(place), "name": trial.name, **description})
     files.make(steps, partial(write_overlay, trials), partial(picture_overlay, trials), partial(show_overlay, trials))
-    return {"trials": told}
+    return {"trials": descriptions}
 
 
 def _trials(
     place: Path, reference: "Reference | None", names: tuple[str, ...], angles: str | None, steps: Steps
 ) -> "list[tuple[Trial, dict[str, Any]]]":
-    """Return the trials of one file with a description each; laid over the reference where there is one."""
+    """Return the trials of one file with a description each, aligned with the reference if there is one."""
     from cfplan.recording.overlay import subject_of_record, trial_of_record, trial_of_subject
     from cfplan.recording.reader import is_record, read_record
 
     if is_record(place):
-        with steps.step("read") as said:
+        with steps.step("read") as results:
             record = read_record(place)
             name = place.resolve().name if place.is_dir() else place.resolve().parent.name
-            said.append(f"{name}, {record.duration:.1f} s, {len(record.poses.time)} poses")
+            results.append(f"{name}, {record.duration:.1f} s, {len(record.poses.time)} poses")
         if reference is None:
             return [(trial_of_record(record, name), {"format": "cfplan record", "truncated": record.truncated})]
         about = {"format": "cfplan record", "truncated": record.truncated}
@@ -231,16 +234,16 @@ def _read_log(
     from cfplan.recording.importers.formats import read_log
     from cfplan.recording.importers.vicon_header import Rotations
 
-    with steps.step("read") as said:
+    with steps.step("read") as results:
         log = read_log(place, rotations=Rotations(angles) if angles else None)
         subjects = log.select(names, where=str(place))
-        said.append(f"{log.format}: {', '.join(subject.name for subject in subjects)}")
-        said.extend(
+        results.append(f"{log.format}: {', '.join(subject.name for subject in subjects)}")
+        results.extend(
             f"{subject.name} unseen in {100 * (1 - subject.seen.mean()):.1f} % of {subject.duration:.1f} s"
             for subject in subjects
             if not subject.seen.all()
         )
-        said.extend(log.notes)
+        results.extend(log.notes)
     return subjects, {"format": log.format, "truncated": log.truncated, "notes": list(log.notes)}
 
 
@@ -251,9 +254,9 @@ def _laid(
 
     from cfplan.recording.overlay import align, trial_of_subject
 
-    with steps.step("align") as said:
+    with steps.step("align") as results:
         found = align(subject, reference)
-        said.append(f"{subject.name}: {found}")
+        results.append(f"{subject.name}: {found}")
         if not found.alike:
-            said.append(f"it does not look like a flight of {reference.name}")
+            results.append(f"it does not look like a flight of {reference.name}")
     return trial_of_subject(subject, reference, found.offset), {**about, "alignment": asdict(found)}

@@ -1,4 +1,4 @@
-"""`cfplan robustness`: how a plan changes with its path."""
+"""`cfplan robustness`: measure how a plan changes with its path."""
 
 import math
 from pathlib import Path
@@ -20,23 +20,27 @@ COLUMNS = [
 ]  # fmt: skip
 
 
-@click.command(short_help="How a plan changes with its path.", epilog="Example: cfplan robustness flights/slalom.yaml")
+@click.command(
+    short_help="Test a plan against changes of its path.", epilog="Example: cfplan robustness flights/slalom.yaml"
+)
 @options.path_file
-@click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="Limits; else the nearest safety.yaml.")
+@click.option(
+    "--safety", "safety_file", type=click.Path(path_type=Path), help="Limits.  [default: the nearest safety.yaml]"
+)
 @click.option("--planner", default="auto", show_default=True, help="auto, learned, expert, convex or minsnap.")
 @click.option(
     "--epsilon", "scales", type=click.FloatRange(0, min_open=True), multiple=True,
-    help="m by which the path is moved at most; may be given several times.  [default: 0.001, 0.01, 0.1]",
+    help="Largest displacement of the path, m; repeatable.  [default: 0.001, 0.01, 0.1]",
 )  # fmt: skip
-@click.option("--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbed paths of each.")
+@click.option("--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbed paths per --epsilon.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @options.as_json
 def robustness(
     path_file: Path, safety_file: Path | None, as_json: bool, scales: tuple[float, ...], **given: Any
 ) -> None:
-    """Move a path a little, plan it again, and rehearse that: how time, speed, yaw and deviation change.
+    """Perturb a path, plan and rehearse it again, and show how time, speed, yaw and deviation change.
 
-    What is moved stays smooth, at rest where it was, and nowhere farther away than --epsilon.
+    A perturbed path is smooth, at rest where the original is, and within --epsilon of it everywhere.
     """
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.REHEARSAL)
@@ -45,7 +49,7 @@ def robustness(
         from cfplan.machine_code import compile_from_here
         from cfplan.preparation.path_robustness import path_robustness
 
-    compile_from_here()  # without, simulating takes minutes
+    compile_from_here()  # simulating without machine code takes minutes
     with steps.step("robustness") as results:
         chosen: dict[str, Any] = {"scales": scales} if scales else {}
         result = path_robustness(load_path_file(path_file), limits, **chosen, **given)

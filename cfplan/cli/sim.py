@@ -1,4 +1,4 @@
-"""`cfplan sim`: the dry run alone."""
+"""`cfplan sim`: rehearse a flight in the dry run."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -11,12 +11,12 @@ from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.preparation.compiled_calls import Stage
 
 
-@click.command(short_help="The dry run alone.", epilog="Example: cfplan sim flights/slalom.yaml")
+@click.command(short_help="Rehearse a flight in the dry run.", epilog="Example: cfplan sim flights/slalom.yaml")
 @options.path_or_plan
 @options.planning
 @options.as_json
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
-    """Rehearse a path or a plan file: its very setpoints, the firmware's controller, a body with drag and motor lag."""
+    """Rehearse a path or a plan file with its actual setpoints, the firmware's controller, drag and motor lag."""
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners and simulator"):

@@ -1,4 +1,4 @@
-"""Tables that fit the terminal: text wraps, numbers never do, and what is still too wide is printed across."""
+"""Tables that fit the terminal: text wraps, numbers do not, and tables that are still too wide are transposed."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,16 +9,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-_LEAST_TEXT = 12  # characters, to which a column of text is wrapped at most
-_LONGEST_NUMBER = 24  # characters, with its unit; what is longer is a sentence that begins with a number
+_LEAST_TEXT = 12  # characters, least width to which a column of text is wrapped
+_LONGEST_NUMBER = 24  # characters, with its unit; longer cells are sentences that begin with a number
 _NUMBER = re.compile(r"[-+–(≤≥<>]?\s*\d.*|[-–]?")
-_UNBOUNDED = 100_000  # characters, of a console on which any table fits
+_UNBOUNDED = 100_000  # characters, width of a console that fits any table
 
 Rows = Sequence[Sequence[str]]
 
 
 def print_fitting(console: Console, title: str, columns: Sequence[str], rows: Rows) -> None:
-    """Print a table no wider than the console; where even wrapping cannot do that, with a column for each row."""
+    """Print a table no wider than the console; if wrapping is not enough, with a column for each row."""
     with console.capture() as drawn:
         console.print(Text(title, "italic"))
         for table in _fitting(console, columns, rows):
@@ -27,7 +27,7 @@ def print_fitting(console: Console, title: str, columns: Sequence[str], rows: Ro
 
 
 def _fitting(console: Console, columns: Sequence[str], rows: Rows) -> Iterator[Table]:
-    """Yield the table itself if it fits, else parts of it turned over, each with as many of the rows as fit."""
+    """Yield the table itself if it fits, else transposed parts of it, each with as many of the rows as fit."""
     table = _table(columns, rows)
     if not rows or len(columns) < 3 or _fits(console, table):
         yield table
@@ -45,7 +45,7 @@ def _fits(console: Console, table: Table) -> bool:
 
 
 def _turned(columns: Sequence[str], rows: Rows) -> Table:
-    """Return the table with a column for each row, under the row's first cell."""
+    """Return the transposed table: a column for each row, headed by the row's first cell."""
     (corner, *heads), *lines = zip(columns, *rows, strict=True)
     return _table([corner, *heads], lines)
 
@@ -63,7 +63,7 @@ def _table(columns: Sequence[str], rows: Rows) -> Table:
 
 
 def _least_width(column: str, cells: Sequence[str], *, numeric: bool) -> int:
-    """Return how narrow a column may be: its longest number or word, and a little more of text."""
+    """Return the least width of a column: that of its longest number or word, and more for text."""
     words = _longest(" ".join((column, *cells)).split())
     return max(words, _longest(cells) if numeric else min(_LEAST_TEXT, _longest((column, *cells))))
 

@@ -1,4 +1,4 @@
-"""`cfplan train`: from a dataset to a model."""
+"""`cfplan train`: train a model on a dataset."""
 
 import sys
 from dataclasses import asdict
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command(
-    short_help="A model of the expert from a dataset.",
+    short_help="Train a model of the expert on a dataset.",
     epilog="Example: cfplan train datasets/hardware -o models/hardware --epsilon 0.001",
 )
 @click.argument("dataset", metavar="DATASET", type=click.Path(path_type=Path))
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
 @click.option("--layers", type=int, default=2, show_default=True)
 @click.option("--window", type=int, default=64, show_default=True, help="Intervals that the network sees at once.")
 @click.option("--epochs", type=int, default=40, show_default=True)
-@click.option("--windows", type=int, default=2, show_default=True, help="Windows of each path, an epoch.")
-@click.option("--batch", type=int, default=64, show_default=True, help="Windows a step.")
-@click.option("--rate", type=float, default=2e-3, show_default=True, help="Learning rate at its highest.")
+@click.option("--windows", type=int, default=2, show_default=True, help="Windows of each path per epoch.")
+@click.option("--batch", type=int, default=64, show_default=True, help="Windows per step.")
+@click.option("--rate", type=float, default=2e-3, show_default=True, help="Highest learning rate.")
 @click.option("--epsilon", type=float, default=0.0, help="Perturb the paths of half the windows by at most this, m.")
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda; several GPUs under torchrun.")
 @options.as_json
 def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) -> None:
-    """Train a model on DATASET. Given again after a stop, it goes on where the last whole epoch ended."""
+    """Train a model on DATASET. An interrupted training resumes after its last complete epoch."""
     if not dataset.is_dir():  # before torch is loaded, which takes seconds
         raise InputError("no such dataset", where=str(dataset), hint="make one: `cfplan dataset make` says how")
     try:
@@ -78,7 +78,7 @@ def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) 
 
 
 def _progress(as_json: bool) -> "Progress":
-    """Return a bar with the epochs, the time passed and the time left."""
+    """Return a progress bar with epochs, time passed and time left."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -101,5 +101,5 @@ def _line(epoch: Any) -> str:
 
 
 def _command() -> str:
-    """Return the command as typed; of absolute paths the last part, as the rest means nothing elsewhere."""
+    """Return the command as typed, with absolute paths reduced to their last part."""
     return " ".join(["cfplan", *(Path(word).name if Path(word).is_absolute() else word for word in sys.argv[1:])])

@@ -1,4 +1,4 @@
-"""`cfplan virtual`: the virtual Crazyflie for other clients."""
+"""`cfplan virtual`: serve the virtual Crazyflie to other clients."""
 
 import os
 import select
@@ -29,15 +29,15 @@ _LOOK = 0.05  # s
 _MOST = 5  # vehicles: cfclient scans ten ports, and each has two
 _APART = 1.0  # m between vehicles that stand side by side
 _LAST_PORT = 65535
-FLOW_DECK = "deck.bcFlow2"  # the firmware's parameter, 1 where the deck was found at start
+FLOW_DECK = "deck.bcFlow2"  # firmware parameter, 1 if the deck was detected at start
 LOCKED = (
-    "the supervisor has locked: its last flight ended without the word that no setpoints follow, and motors stay off "
+    "the supervisor has locked: the last flight ended without a notice that setpoints stop, and motors stay off "
     "until the vehicle is restarted (key r; without a keyboard, end this command and start it again)"
 )
 
 
 @click.command(
-    short_help="A virtual Crazyflie for cfclient and other scripts.",
+    short_help="Serve a virtual Crazyflie to cfclient and other scripts.",
     epilog="""\b
 Examples:
   cfplan virtual                                  then connect to udp://127.0.0.1:19850
@@ -50,7 +50,7 @@ Examples:
 )
 @click.option(
     "--port", type=click.IntRange(1024, 65534), default=19850, show_default=True,
-    help="UDP; cfclient scans 19850 to 19859. The next port gives poses; each other vehicle has two more.",
+    help="UDP port; cfclient scans 19850 to 19859. The next port sends poses; each further vehicle takes two more.",
 )  # fmt: skip
 @click.option(
     "--count", type=click.IntRange(1, _MOST), default=1, show_default=True,
@@ -58,17 +58,17 @@ Examples:
 )  # fmt: skip
 @click.option(
     "--vicon", "vicon_port", type=click.IntRange(1024, 65535),
-    help="TCP; a virtual Vicon shows them there as cf1, cf2, …, and they have no poses on board.",
+    help="TCP port of a virtual Vicon with subjects cf1, cf2, …; the vehicles then have no poses on board.",
 )  # fmt: skip
 @click.option(
     "--flow-deck", is_flag=True,
-    help="Say that a flow deck is on board, which scripts look for; the poses on board are as good as without.",
+    help="Report a flow deck, for scripts that require one; poses on board do not change.",
 )  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0.1), help="End after this time; else with Ctrl-C.")
-@click.option("--live", is_flag=True, help="Show it in rerun.")
+@click.option("--seconds", type=click.FloatRange(0.1), help="Time to serve, s.  [default: until Ctrl-C]")
+@click.option("--live", is_flag=True, help="Show the first vehicle in rerun.")
 @click.option(
     "--safety", "safety_file", type=click.Path(path_type=Path),
-    help="File that names the vehicle to serve; else the nearest safety.yaml, else that of the examples.",
+    help="File that names the vehicle.  [default: the nearest safety.yaml, else that of the examples]",
 )  # fmt: skip
 def virtual(
     port: int,
@@ -81,8 +81,8 @@ def virtual(
 ) -> None:
     """Serve virtual Crazyflies over UDP, with poses on board as from a positioning deck, or by a virtual Vicon.
 
-    As on the real one, the supervisor locks after a flight that ended without a word: then nothing flies until the
-    vehicle is restarted, with the key r.
+    As on a real vehicle, the supervisor locks after a flight whose setpoints end without notice; the vehicle then has
+    to be restarted, with the key r.
     """
     from cfplan.safety.limits_file import load_limits
 
@@ -106,28 +106,28 @@ def virtual(
 
 @dataclass(frozen=True, slots=True)
 class VirtualRoom:
-    """The vehicles to serve, and how."""
+    """The vehicles to serve, and their ports and poses."""
 
     limits: "Limits"
     port: int
     count: int
-    vicon_port: int | None  # None: poses come on board
-    flow_deck: bool = False  # its parameter says that it is there
+    vicon_port: int | None  # None: the vehicles have poses on board
+    flow_deck: bool = False  # its parameter reports it
 
     @property
     def names(self) -> list[str]:
-        """Return the names of the vehicles, as motion capture has them."""
+        """Return the names of the vehicles in motion capture."""
         return [f"cf{number}" for number in range(1, self.count + 1)]
 
     def places(self) -> list[tuple[float, float, float]]:
-        """Return where they stand, m: the first at the origin, the others on its sides along y, inside the space."""
+        """Return their positions, m: the first at the origin, the others beside it along y, inside the space."""
         space = self.limits.space
         reach = min(-space.low[1], space.high[1]) - space.margin
         apart = min(_APART, max(reach, 0.0) / max(self.count // 2, 1))
         return [(0.0, apart * ((k + 1) // 2) * (1 if k % 2 else -1), 0.0) for k in range(self.count)]
 
     def require_ports(self) -> None:
-        """Raise InputError where the ports of the vehicles go beyond what there is, or what they have does not fit."""
+        """Raise InputError if the vehicles need ports beyond the last one, or their options contradict each other."""
         if self.flow_deck and self.vicon_port:
             raise InputError(
                 "with a virtual Vicon the vehicles have no poses on board, and so no flow deck",
@@ -139,7 +139,7 @@ class VirtualRoom:
             raise InputError(f"{self.count} vehicles need ports to {last}", where="--port", hint="choose a lower one")
 
     def start(self) -> "Lab":
-        """Start the lab. Raises LinkError, or InputError where a port is taken."""
+        """Start the lab. Raises LinkError, or InputError if a port is taken."""
         from cfplan.simulation.lab.lab import start_lab
         from cfplan.simulation.lab.room import RoomSettings
         from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -159,7 +159,7 @@ class VirtualRoom:
         )
 
     def describe(self, lab: "Lab") -> str:
-        """Return where each is found."""
+        """Return a line with each vehicle's URI, and the keys."""
         mocap = f" --mocap vicon://127.0.0.1:{self.vicon_port}/" if self.vicon_port else ""
         found = [f"{self.limits.vehicle} {name}: --uri udp://127.0.0.1:{port}" + (mocap and mocap + name)
                  for name, port in zip(self.names, lab.ports, strict=True)]  # fmt: skip
@@ -167,7 +167,7 @@ class VirtualRoom:
 
 
 def _serve(room: VirtualRoom, end: float, view: "LiveView | None", typed: Callable[[], bytes]) -> bool:
-    """Serve the vehicles until time is up, or until the key r is typed: then return True."""
+    """Serve the vehicles until the time is up; return True if the key r is typed before."""
     from cfplan.simulation.virtual_crazyflie.supervisor import State
 
     shown = [StateLine(name if room.count > 1 else "") for name in room.names]
@@ -190,9 +190,9 @@ def _serve(room: VirtualRoom, end: float, view: "LiveView | None", typed: Callab
 
 
 class StateLine:
-    """Says what the supervisor does: on a terminal in its last line with the position, elsewhere a line a change.
+    """Shows the supervisor's state: on a terminal in its last line, with the position, elsewhere in a line per change.
 
-    With a name, of one of several vehicles, always the latter.
+    With a name, for one of several vehicles, it always prints a line per change.
     """
 
     def __init__(self, name: str = "") -> None:
@@ -201,7 +201,7 @@ class StateLine:
         self._on_terminal = sys.stderr.isatty() and not name
 
     def show(self, state: IntEnum, position: Sequence[float]) -> None:
-        """Show the state and where the vehicle is; that it is locked, in words wherever the output goes."""
+        """Show the state and the position; a locked supervisor is explained on any output."""
         changed, self._state = state is not self._state, state
         locked = state.name == "LOCKED"
         name = state.name.lower().replace("_", " ")
@@ -214,7 +214,7 @@ class StateLine:
 
 
 def _show(truth: "Truth", view: "LiveView | None") -> None:
-    """Show where the vehicle is in the view."""
+    """Show the vehicle's latest pose in the view."""
     from cfplan.flight.telemetry import PoseReceived
 
     if view is not None:
@@ -226,7 +226,7 @@ def _show(truth: "Truth", view: "LiveView | None") -> None:
 
 @contextmanager
 def _typed() -> Iterator[Callable[[], bytes]]:
-    """Return what was typed since the last call, key by key; nothing where standard input is no terminal."""
+    """Yield a function that returns the keys typed since its last call; nothing if standard input is not a terminal."""
     if not sys.stdin.isatty():
         yield bytes
         return

@@ -1,4 +1,4 @@
-"""Compiles what flights need ahead of time, in other processes, and shows how far that is."""
+"""Compile the functions that flights need ahead of time, in other processes, and show the progress."""
 
 import os
 import subprocess
@@ -19,9 +19,9 @@ LEAST_PRIORITY = 19  # see nice(2)
 
 
 class Worker:
-    """A process that compiles the calls of a stage, one after the other, from the end or from a place of its own.
+    """A process that compiles the calls of a stage one after another, from the end or from a given position.
 
-    It goes on when this process ends.
+    It continues when this process ends.
     """
 
     def __init__(self, stage: Stage, safety_file: Path, first: str):
@@ -40,19 +40,19 @@ class Worker:
             self.done, self.total = map(int, line.split())
 
     def progress(self) -> str:
-        """Return how far compiling is, in words; nothing once it is done."""
+        """Return the progress of compiling, in words; empty once it is done."""
         if self.process.poll() is not None:
             return ""
         return "compiling, once for this machine" + (f": {self.done} of {self.total} functions" if self.total else "")
 
     def stop(self) -> None:
-        """End the process; what it was compiling is lost."""
+        """End the process; the function being compiled is lost."""
         self.process.kill()
         self.process.wait()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Stop, and begin anew behind the block if not all was compiled."""
+        """Stop, and start again after the block unless everything is compiled."""
         done = self.process.poll() == 0
         self.stop()
         yield
@@ -61,9 +61,9 @@ class Worker:
 
 
 def compile_ahead(stage: Stage, safety_file: Path, steps: Steps) -> str:
-    """Compile what a command is going to need in another process, from the end of its way; return words that say so.
+    """Compile in another process what a command will need, beginning with what it needs last; return a note about it.
 
-    Where planning is not compiled either, the command goes without_compiling(). Does nothing where all is compiled.
+    If planning is not compiled either, the command runs without_compiling(). Does nothing if everything is compiled.
     """
     from cfplan.machine_code import kept, without_compiling
 
@@ -80,13 +80,13 @@ def compile_ahead(stage: Stage, safety_file: Path, steps: Steps) -> str:
 
 
 def compiling_paused() -> AbstractContextManager[None]:
-    """Return a block in which nothing is compiled ahead: where a vehicle flies, processors are for that alone."""
+    """Return a context manager that pauses compiling ahead, so that a flight has the processors to itself."""
     worker: Worker | None = click.get_current_context().meta.get(__name__)
     return nullcontext() if worker is None else worker.paused()
 
 
 def warm_up(safety_file: Path, processes: int) -> None:
-    """Compile everything that flights need, and return when that is done."""
+    """Compile everything that flights need, and wait for it."""
     begun = time.perf_counter()
     workers = [Worker(Stage.FLIGHT, safety_file, f"{number / processes:.3f}") for number in range(processes)]
     try:
@@ -113,7 +113,7 @@ def _all_ended(workers: list[Worker], seconds: float) -> bool:
 
 
 def _ready(stage: Stage) -> bool:
-    """Return whether all that a stage calls was compiled."""
+    """Return whether all calls of a stage are compiled."""
     return any(_ready_file(each).exists() for each in Stage if each >= stage)
 
 
@@ -124,10 +124,10 @@ def _ready_file(stage: Stage) -> Path:
 
 
 def work(stage: Stage, safety_file: Path, first: str) -> None:
-    """Compile the calls of a stage, leaving out what other processes are at; print how many are compiled of how many.
+    """Compile the calls of a stage that no other process is compiling; print the number compiled and the total.
 
-    `first` is "last", or how far along the calls to begin, in [0, 1). Of those whose command has ended, one at a time
-    goes on.
+    `first` is "last", or the fraction of the calls at which to begin, in [0, 1). Of the processes whose command has
+    ended, only one at a time continues.
     """
     from cfplan.machine_code import compile_call, delete_unused, is_compiled
 
@@ -140,7 +140,7 @@ def work(stage: Stage, safety_file: Path, first: str) -> None:
                 return
             _print_unless_alone(sum(map(is_compiled, calls)), len(calls))
             if not is_compiled(call) and compile_call(call) and not is_compiled(call):
-                return  # it could not be written
+                return  # the cache cannot be written
         time.sleep(0.1)
     _print_unless_alone(len(calls), len(calls))
     _ready_file(stage).touch()
@@ -148,14 +148,14 @@ def work(stage: Stage, safety_file: Path, first: str) -> None:
 
 
 def _may_go_on(parent: int) -> bool:
-    """Return False if the parent has ended and another such process goes on already."""
+    """Return False if the parent has ended and another such process already continues."""
     from cfplan.machine_code import claim
 
     return os.getppid() == parent or claim("compiling in the background")
 
 
 def _step_back_once_alone() -> None:
-    """Wait until the process that holds our input has ended; compile from then on when nobody needs the processor."""
+    """Wait until the parent, which holds the input pipe, has ended; then compile at the lowest priority."""
     while os.read(0, 1):
         pass
     os.setpriority(os.PRIO_PROCESS, os.getpid(), LEAST_PRIORITY)

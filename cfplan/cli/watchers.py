@@ -1,4 +1,4 @@
-"""The watchers of a flight besides its record: a live view in rerun, a ground station."""
+"""The watchers of a flight besides its record: a live view in rerun and a ground station."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -18,35 +18,35 @@ TLOG_FILE = "telemetry.tlog"
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """Those that watch, as long as they do."""
+    """The open watchers of a flight."""
 
     view: "LiveView | None"
     station: "GroundStation | None"
 
     @property
     def listeners(self) -> "list[Callable[[Telemetry], None]]":
-        """Return what wants every message."""
+        """Return the listeners for every message."""
         return [watcher.show for watcher in (self.view, self.station) if watcher is not None]
 
     def orders(self) -> "Sequence[Order]":
-        """Return what the ground station commanded since the last call."""
+        """Return the ground station's commands since the last call."""
         return self.station.orders() if self.station is not None else ()
 
     def failures(self) -> list[str]:
-        """Return what went wrong with watching; none of it touched the flight."""
+        """Return the failures of watchers; none of them affects the flight."""
         return [watcher.failure for watcher in (self.view, self.station) if watcher is not None and watcher.failure]
 
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Who is asked to watch."""
+    """The requested watchers."""
 
     live: bool  # a live view in rerun
-    mavlink: str | None  # where a ground station listens, as udp:127.0.0.1:14550
+    mavlink: str | None  # address of a ground station, e.g. udp:127.0.0.1:14550
 
 
 def check_watchers(watched: Watched) -> None:
-    """Raise InputError, before anything is planned, where a watcher is not available."""
+    """Raise InputError, before anything is planned, if a watcher is not available."""
     if watched.live:
         from cfplan.recording.rerun.viewer import require_screen
 
@@ -59,7 +59,7 @@ def check_watchers(watched: Watched) -> None:
 
 @contextlib.contextmanager
 def watchers(header: "RecordHeader", folder: Path, watched: Watched) -> Iterator[Watching]:
-    """Open the watchers that were asked for while the block lasts; the .tlog lies in the record's folder."""
+    """Open the requested watchers while the block lasts; the .tlog is written to the record's folder."""
     with contextlib.ExitStack() as stack:
         view = station = None
         if watched.live:

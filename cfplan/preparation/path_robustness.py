@@ -1,7 +1,7 @@
-"""How a plan changes with its path: the same path perturbed, planned again, and flown in the dry run.
+"""Measure how a plan changes with its path: perturb the path, plan it again, and fly it in the dry run.
 
-A path that was measured, or drawn a little differently the next day, should give nearly the same flight. This says
-whether it does, as the paper asks it of its networks.
+A path that is measured or drawn slightly differently should give nearly the same flight. The paper tests its networks
+for this; here any planner can be tested.
 """
 
 import pathlib
@@ -23,7 +23,7 @@ from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
 
 SCALES = (0.001, 0.01, 0.1)  # m
-SAMPLES = 500  # places along the path at which speed and yaw are compared
+SAMPLES = 500  # points along the path at which speed and yaw are compared
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +32,7 @@ class PerturbedPlan:
 
     epsilon: float  # m
     draw: int
-    reason: str = ""  # why it was not planned, or why its setpoints or its dry run are refused
+    reason: str = ""  # why it was not planned, or why its setpoints or dry run were refused
     flight: float = np.nan  # s
     longer: float = np.nan  # relative change of the time of flight
     faster: float = np.nan  # m/s, largest change of speed at a fraction of the path, either way
@@ -47,7 +47,7 @@ class ScaleSummary:
     epsilon: float  # m
     plans: int
     certified: int
-    flown: int  # passed the dry run
+    flown: int  # plans that passed the dry run
     longer: float  # relative change of the time of flight, mean
     longer_most: float  # the one farthest from 0
     faster: float  # m/s, mean over the draws of the largest change of speed
@@ -58,12 +58,12 @@ class ScaleSummary:
 
 @dataclass(frozen=True, slots=True)
 class PathRobustness:
-    """A path as it is, and perturbed."""
+    """The results for a path, unperturbed and perturbed."""
 
     path: str
     length: float  # m
-    flight: float  # s, as it is
-    interrupted: bool  # by the user: has what was measured until then
+    flight: float  # s, of the unperturbed path
+    interrupted: bool  # by the user: holds the results so far
     scales: tuple[ScaleSummary, ...]
     plans: tuple[PerturbedPlan, ...]
 
@@ -78,11 +78,11 @@ def path_robustness(
     planner: str = AUTO,
     models: tuple[pathlib.Path, ...] = (),
 ) -> PathRobustness:
-    """Perturb the path `draws` times by at most each of `scales`, m; an interrupt keeps what is measured by then.
+    """Perturb a path `draws` times by at most each of `scales`, m; an interrupt returns the results so far.
 
     Raises:
-        InputError: no draw, or a scale that is no length.
-        InfeasibleError: the path as it is cannot be planned.
+        InputError: `draws` is below 1, or a scale is not a positive length.
+        InfeasibleError: the unperturbed path cannot be planned.
     """
     if draws < 1 or not scales or not all(0.0 < scale < np.inf for scale in scales):
         raise InputError(
@@ -153,5 +153,5 @@ def _summaries(done: Sequence[PerturbedPlan]) -> Iterator[ScaleSummary]:
 
 
 def _finite(values: Iterable[float]) -> np.ndarray:
-    """Return those that are finite as an array that is never empty: of none it holds NaN."""
+    """Return the finite values as an array, or [NaN] if there are none."""
     return np.array([value for value in values if np.isfinite(value)] or [np.nan])

@@ -1,7 +1,7 @@
-"""Make the results of all of the paper's tables, one study after the other.
+"""Make the results for all of the paper's tables, one study after another.
 
-A run that was stopped goes on: a result of the present sources and the same settings is kept, any other is made anew,
-from the cases that were finished.
+A run that was stopped resumes: a result of the present sources and settings is kept, any other is measured again,
+starting from its finished cases.
 """
 
 import importlib
@@ -23,27 +23,27 @@ QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType({
     "baselines": {"paths": 1, "quick": True}, "hardware": {"paths": 1, "quick": True},
     "simulators": {"paths": 1, "quick": True},
 })  # fmt: skip
-"""The studies, and the settings by which each is tried in a few seconds; by default they have the paper's."""
+"""The studies, each with settings for a quick try; a full run uses their defaults, which are the paper's settings."""
 
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """What became of one study."""
+    """The result of one study."""
 
     file: Path
     result: StudyResult
-    kept: bool  # as it was made before
+    kept: bool  # it was up to date and was not measured again
 
 
 def paper_results(
     folder: Path, *, quick: bool = False, effort: Effort | None = None, studies: Mapping[str, Mapping[str, Any]] = QUICK
 ) -> Iterator[Made]:
-    """Write each study's result to `folder` and yield it; an interrupt ends all after the study under way.
+    """Write each study's result to `folder` and yield it; after an interrupt no further study is run.
 
-    `studies` are by their quick settings, which hold where `quick` is asked for.
+    `studies` maps each study to its quick settings, which are used with `quick`.
 
     Raises:
-        InputError: no such folder or no dataset; what was made by then is kept.
+        InputError: no such folder or no dataset; results that are already written are kept.
     """
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder), hint="make it first")

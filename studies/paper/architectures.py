@@ -1,7 +1,7 @@
-"""Make the paper's Table 1: networks of four architectures, TOPPQuad, the expert and the network that ships.
+"""Make the paper's Table 1: networks of four architectures, TOPPQuad, the expert and the shipped network.
 
-Beside it the planner that ships, on a vehicle as it is: certified for motors that take 0.072 s to follow, sent as
-bytes, flown in the dry run. Training that was stopped goes on from its last epoch.
+A second table shows the shipped planner on a realistic vehicle: certified for a motor time constant of 0.072 s, encoded
+in packets, and flown in the dry run. Interrupted training resumes from its last epoch.
 """
 
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ AS_BYTES = "the shipped planner, as bytes"
 
 @dataclass(frozen=True, slots=True)
 class Settings(NetworkSettings):
-    """Which networks are compared, on which paths."""
+    """The networks to compare, and the paths."""
 
     kinds: tuple[Kind, ...] = option(tuple(Kind), "Architecture.")
 
@@ -69,19 +69,19 @@ SHIPPED_COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path; networks are trained if need be. Raises what `paper_data` raises."""
+    """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
     data = paper_data(settings, run, [SequenceOptions(kind=Kind(kind)) for kind in settings.kinds])
     return Work(data.paths, partial(measure, data.networks), PaperTrial, data.identity)
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
-    """Ask all planners about a path, and fly it by the one that ships."""
+    """Plan a path with all planners, and fly the shipped planner's plan in packets too."""
     trials = path_trials(planners(networks), {each.name: each for each in networks}, asked)
     return [*trials, _shipped(PaperTrial(AS_BYTES, asked.part, asked.row, repaired=True), amid(asked.path))]
 
 
 def tables(settings: Settings, rows: list[PaperTrial]) -> Iterator[Table]:
-    """Yield the paper's table, the same after repair, the flights of the planner that ships, and the trainings."""
+    """Yield the paper's table, the same after repair, the shipped planner's flights, and the trainings."""
     compared = [row for row in rows if row.planner != AS_BYTES]
     yield from planner_tables("architectures", "network", ARCHITECTURES, compared)
     lag = SHIPPED_LIMITS.airframe.motor_time_constant
@@ -92,13 +92,13 @@ def tables(settings: Settings, rows: list[PaperTrial]) -> Iterator[Table]:
 
 
 def amid(path: Path) -> Path:
-    """Return the path in the middle of its room: a packet holds no place farther than 32.8 m from the room's origin."""
+    """Return the path moved to the origin: packets cannot hold positions beyond 32.8 m from it."""
     places = path(np.linspace(0.0, path.end, 1000))
     return path.placed(-0.5 * (places.min(axis=0) + places.max(axis=0)))
 
 
 def shipped_task(path: Path) -> PlanningTask:
-    """Return what the planner that ships is asked about a path."""
+    """Return the task of the shipped planner for a path."""
     return PlanningTask(path, SHIPPED_LIMITS.airframe, SHIPPED_LIMITS.limits, SHIPPED_NODES, YawMode.FIXED)
 
 
@@ -122,7 +122,7 @@ def _planned_violation(trajectory: Trajectory) -> float:
 
 
 def lost_alone() -> FlightLimits:
-    """Return limits by which a flight is over when it is LOST, and by nothing else."""
+    """Return flight limits that end a flight only when it is LOST."""
     never = Ladder(np.inf, np.inf, np.inf)
     return FlightLimits(
         deviation=Ladder(LOST, LOST, LOST), fence=never, speed=never, acceleration=never, angular_velocity=never,

@@ -1,9 +1,9 @@
-"""Make the paper's Table 3: TOPPQuad, networks and the planner that ships beside planners of other kinds.
+"""Make the paper's Table 3: TOPPQuad, networks and the shipped planner compared with planners of other kinds.
 
-TOPPQuad, the paper's networks, the planner that ships and convex TOPP time the min-snap path, and scaled min-snap flies
-it at one factor on its timing. MFBOTrajectory's kind searches for other times of the min-snap segments. A learned time
-allocation flies a path of its own through the corridor about it, as AllocNet does. All are flown by the geometric
-controller.
+TOPPQuad, the paper's networks, the shipped planner and convex TOPP time the min-snap path; scaled min-snap scales the
+path's original timing by one factor. A method like MFBOTrajectory optimises the times of the min-snap segments. A
+learned time allocation, like AllocNet, flies a different path through a corridor around the min-snap path. All plans
+are flown by the geometric controller.
 """
 
 import time
@@ -56,28 +56,28 @@ from studies.runner.reductions import among, count, mean
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-BOX = np.array([10.0, 10.0, 5.0])  # m, where waypoints are drawn
-NOISES = (0.0, 0.1)  # m, of the LSTMs of the table
-QUICK_CORRIDORS = 6  # that the time allocation learns from
+BOX = np.array([10.0, 10.0, 5.0])  # m, sides of the box in which waypoints are drawn
+NOISES = (0.0, 0.1)  # m, noise injected in training the table's LSTMs
+QUICK_CORRIDORS = 6  # corridors for a quick training of the time allocation
 SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
 BAYESIAN = "MFBOTrajectory's kind"
-DRAWN, DRAWN_PATHS, DRAWN_POINTS = (SHIPPED, BAYESIAN, ALLOCATION), 3, 121  # of the figure
+DRAWN, DRAWN_PATHS, DRAWN_POINTS = (SHIPPED, BAYESIAN, ALLOCATION), 3, 121  # the figure's
 
 
 class Course(NamedTuple):
-    """What planners are asked: waypoints, and the min-snap path through them."""
+    """The input of all planners: waypoints, and the min-snap path through them."""
 
     waypoints: NDArray  # (K, 3) m
     path: Path
     seed: int
 
 
-Ask = Callable[[Course], Trajectory]  # raises CfplanError where there is none
+Ask = Callable[[Course], Trajectory]  # raises CfplanError if there is no plan
 
 
 @dataclass(frozen=True, slots=True)
 class Settings(NetworkSettings):
-    """Which paths are planned, and what the time allocation learns from."""
+    """The paths to plan, and the training of the time allocation."""
 
     paths: int = option(50, "Random paths.", least=1)
     corridors: int = option(2000, "Corridors that the time allocation learns from.", least=2)
@@ -90,17 +90,17 @@ class BaselineTrial:
 
     planner: str
     seed: int
-    reason: str = ""  # why there is no flight
-    seconds: float = np.nan  # of the processor, to plan
+    reason: str = ""  # why there is no flight; empty if there is one
+    seconds: float = np.nan  # s of processor time to plan
     travel_time: float = np.nan  # s
-    length: float = np.nan  # m, of the path that is flown
+    length: float = np.nan  # m, of the flown path
     deviation: float = np.nan  # m, LOST where it failed
-    thrust_least: float = np.nan  # N, planned, of a motor
+    thrust_least: float = np.nan  # N, least planned thrust of a motor
     thrust_most: float = np.nan  # N
     violation: float = np.nan  # N, planned beyond a motor's range, mean over time
     top_speed: float = np.nan  # m/s, planned
-    retraining: float | None = None  # s of the processor, once for a vehicle and its limits
-    points: list[list[float]] = field(default_factory=list)  # m, along the motion, where that is drawn
+    retraining: float | None = None  # s of processor time, once per vehicle and limits
+    points: list[list[float]] = field(default_factory=list)  # m, along the motion, if it appears in the figure
 
     @property
     def speed(self) -> float:
@@ -109,13 +109,13 @@ class BaselineTrial:
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path; networks and the time allocation are trained if need be.
+    """Return one case per path; networks and the time allocation are trained if necessary.
 
-    Raises InputError where scikit-learn is not installed; as `paper_data`.
+    Raises InputError if scikit-learn is not installed, and as `paper_data`.
     """
     require_library()
     data = paper_data(settings, run, [SequenceOptions(epsilon=epsilon) for epsilon in NOISES], paths=1)
-    first = 10 * settings.seed  # of the corridors' paths, which are none of those that are flown
+    first = 10 * settings.seed  # seed of the corridors' paths, which differ from the flown ones
     corridors = range(first, first + (QUICK_CORRIDORS if settings.quick else settings.corridors))
     labels, training = dict[int, NDArray | None](), 0.0
     with pool(run.workers, run.scheduler) as measured:
@@ -134,7 +134,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def _label(seed: int) -> tuple[int, NDArray | None, float]:
-    """Return the seed of a path, the label of the corridor about it, and the seconds that it took the processor."""
+    """Return the seed of a path, the label of the corridor around it, and the processor time, s."""
     begun = time.process_time()
     label = time_label(corridor_about(random_course(seed).path))
     return seed, label, time.process_time() - begun
@@ -155,7 +155,7 @@ def planners(networks: Sequence[TrainedNetwork], allocation: TimeNetwork, budget
 
 
 def random_course(seed: int) -> Course:
-    """Return the waypoints and path of that seed; one that leaves the box by far is drawn anew, as for training."""
+    """Return the waypoints and path of a seed; paths longer than MAX_LENGTH are drawn again, as for training."""
     attempt = 0
     while True:
         drawn = np.random.SeedSequence(seed, spawn_key=(attempt,))
@@ -183,7 +183,7 @@ def measure(
     asked: Callable[[Budget], dict[str, Ask]], budget: Budget, retraining: Mapping[str, float], drawn: Sequence[int],
     seed: int,
 ) -> list[BaselineTrial]:  # fmt: skip
-    """Plan and fly one path by each planner; of the paths that are `drawn`, by their seeds, keep the motion."""
+    """Plan and fly one path with each planner; keep the motions of paths whose seed is in `drawn`, for the figure."""
     course, trials, quick = random_course(seed), [], asked(QUICK_BUDGET)
     for name, ask in asked(budget).items():
         warm_up(name, partial(quick[name], course))
@@ -249,7 +249,7 @@ COLUMNS = (
 
 
 def tables(settings: Settings, rows: list[BaselineTrial]) -> Iterator[Table]:
-    """Yield the paper's Table 3 with the paper's numbers beside."""
+    """Yield the paper's Table 3 beside the paper's numbers."""
     title = (
         f"Paths through {WAYPOINTS} random waypoints in {' × '.join(f'{side:g}' for side in BOX)} m, "
         f"{SPEED:g} m/s, motor lag {PAPER_LAG:g} s; {ALLOCATION}: {ACCELERATION:g} m/s²"

@@ -1,16 +1,16 @@
 """Segment times by multi-fidelity Bayesian optimisation, as MFBOTrajectory finds them.
 
 G. Ryou, E. Tal, S. Karaman, "Multi-fidelity black-box optimization for time-optimal quadrotor maneuvers" (2021). A
-motion through waypoints depends on the times of its segments alone; which times can be flown is learned, by classifiers
-that are Gaussian processes, from asking two checks of different cost. Each step asks the check and the times that
-promise the largest gain of time, or where none does, those that the classifiers are least certain of.
+motion through waypoints depends only on the times of its segments. Gaussian process classifiers learn which times can
+be flown from two checks of different cost. Each step evaluates the check and the times with the largest expected gain
+of time or, if no gain is likely, those where the classifiers are least certain.
 
-What is theirs: times as factors on the fastest uniform timing of each check, half of the cheap check's samples feasible
-and half not, uniform timings to begin the dear one, acquisition, thresholds and budgets. The classifier of the dear
-check sees the latent value of the cheap one beside the factors. What differs: hyperparameters are fitted by
-scikit-learn, with Laplace's approximation and without inducing points (classifier.py beside this file goes on from
-there); there are CANDIDATES in place of 16,384; the lower confidence bound
-is CONFIDENCE standard deviations below the mean.
+As published: times are factors on the fastest uniform timing of each check, half of the cheap check's samples are
+feasible, uniform timings initialise the expensive check, and so are acquisition, thresholds and budgets. The classifier
+of the expensive check has the latent value of the cheap one as an additional input. Different from the publication:
+scikit-learn fits hyperparameters, with Laplace's approximation and without inducing points (classifier.py beside this
+file updates the fit); there are CANDIDATES in place of 16,384; the lower confidence bound is CONFIDENCE standard
+deviations below the mean.
 """
 
 import warnings
@@ -27,39 +27,39 @@ from cfplan.errors import InfeasibleError, InputError
 from studies.paper.classifier import fit
 
 Check = Callable[[NDArray], bool]  # whether a motion with these segment times, (S,) s, passes
-LEAST, MOST = 0.1, 1.9  # factors on the nominal times that are considered
-SPREAD = 0.2  # of the half of the cheap samples that are drawn about the nominal times
+LEAST, MOST = 0.1, 1.9  # range of factors on the nominal times
+SPREAD = 0.2  # standard deviation of the factors of cheap samples drawn around the nominal times, half of all
 STEPS = 14  # of the bisection for the fastest uniform timing
-CANDIDATES = 1024  # that each step chooses from
+CANDIDATES = 1024  # candidates of each step
 SHAPED = 300  # samples of the cheap check to which its classifier's hyperparameters are fitted
 NEAR, FAR = 0.01, 0.3  # standard deviations of candidates about the best factors, drawn between
 CONFIDENCE = 1.0
-SURE_LOW, SURE_HIGH = 0.1, 0.4  # least probability to pass, by the lower bound, for a check to be asked for its gain
-COST_LOW, COST_HIGH = 1.0, 10.0  # weights of the two checks where the least certain times are sought
-_LATENT = 5.0  # at most, as an input: beyond it the cheap check is certain
+SURE_LOW, SURE_HIGH = 0.1, 0.4  # least probability to pass, by the lower bound, for a gain to count
+COST_LOW, COST_HIGH = 1.0, 10.0  # cost weights of the two checks in the search for the least certain times
+_LATENT = 5.0  # bound of the latent value as an input: beyond it the cheap check is certain
 
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How often the checks may be asked: the published numbers."""
+    """The number of evaluations of the checks; the defaults are the published numbers."""
 
     low: int = 1000  # cheap samples before the first step
-    high: int = 20  # dear ones
-    iterations: int = 50  # dear ones that are chosen
-    more_low: int = 50  # cheap ones that are chosen
+    high: int = 20  # expensive samples before the first step
+    iterations: int = 50  # expensive evaluations by acquisition
+    more_low: int = 50  # cheap evaluations by acquisition, at most
 
 
 class OptimisedTimes(NamedTuple):
-    """The fastest times that passed the dear check."""
+    """The fastest times that passed the expensive check."""
 
     times: NDArray  # (S,) s
-    uniform: float  # s in all, of the fastest uniform timing that passed it
+    uniform: float  # s, total time of the fastest uniform timing that passed it
     asked_low: int
     asked_high: int
 
 
 class _Samples:
-    """What one check was asked, in factors on its own nominal times, and what it answered."""
+    """The evaluations of one check: factors on its nominal times, and whether they passed."""
 
     def __init__(self, check: Check, nominal: NDArray) -> None:
         self.check, self.asked = check, 0
@@ -81,7 +81,7 @@ class _Samples:
 def optimise_times(
     nominal: NDArray, low: Check, high: Check, *, budget: Budget | None = None, seed: int = 0
 ) -> OptimisedTimes:
-    """Return the fastest times found from `nominal`, (S,) s, whose ratios the uniform timings have.
+    """Return the fastest times found. Uniform timings are multiples of `nominal`, (S,) s.
 
     Raises:
         InfeasibleError: no uniform timing passes a check.
@@ -116,12 +116,12 @@ def optimise_times(
 
 
 def require_library() -> None:
-    """Raise InputError where scikit-learn is not installed."""
+    """Raise InputError if scikit-learn is not installed."""
     _classifier()
 
 
 def _fastest_uniform(passes: Check, nominal: NDArray) -> float:
-    """Return the least factor on all times that passes, to a part in 2^STEPS, if those that pass are the slow ones."""
+    """Return the least factor on all times that passes, by STEPS bisections; assumes that slower times pass too."""
     slow = next((factor for factor in 2.0 ** np.arange(-4, 8) if passes(factor * nominal)), None)
     if slow is None:
         raise InfeasibleError("no timing of this motion passes", hint="give other waypoints")
@@ -133,7 +133,7 @@ def _fastest_uniform(passes: Check, nominal: NDArray) -> float:
 
 
 def _ask_both_kinds(samples: _Samples, count: int, random: np.random.Generator) -> None:
-    """Ask until `count` answers are there, half of each kind; what is left of the commoner kind is let go."""
+    """Evaluate samples until `count` are found, half of which pass; discard the surplus of the more common kind."""
     size, batch = samples.nominal.size, max(count // 10, 1)
     kept: dict[bool, list[NDArray]] = {True: [], False: []}
     for _ in range(100):
@@ -149,7 +149,7 @@ def _ask_both_kinds(samples: _Samples, count: int, random: np.random.Generator) 
 
 
 def _about(best: NDArray, random: np.random.Generator) -> NDArray:
-    """Return candidates, (CANDIDATES, S), about the best factors, near and far."""
+    """Return candidates, (at most CANDIDATES, S), around the best factors, near and far."""
     spread = np.exp(random.uniform(np.log(NEAR), np.log(FAR), (CANDIDATES, 1)))
     drawn = best * (1.0 + spread * random.normal(size=(CANDIDATES, len(best))))
     return np.asarray(drawn[((drawn >= LEAST) & (drawn <= MOST)).all(axis=1)])
@@ -158,7 +158,7 @@ def _about(best: NDArray, random: np.random.Generator) -> NDArray:
 def _next(
     candidates: NDArray, best: NDArray, nominal: NDArray, cheap: Any, dear: Any, may_ask_cheap: bool
 ) -> tuple[Any, NDArray]:
-    """Return the model of the check to ask next, and the factors to ask it about."""
+    """Return the model of the check to evaluate next, and the factors to evaluate it at."""
     gain = (best - candidates) @ nominal / nominal.sum()
     low_mean, low_deviation = _latent(cheap, candidates)
     high_mean, high_deviation = _latent(dear, _with_latent(cheap, candidates, low_mean))
@@ -179,13 +179,13 @@ def _next(
 
 
 def _fitted(inputs: NDArray, passed: NDArray) -> Any:
-    """Return a classifier of what passes, with its hyperparameters fitted."""
+    """Return a classifier of passing inputs with fitted hyperparameters."""
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
     kernel = ConstantKernel(10.0, (0.1, 1e4)) * RBF(np.full(inputs.shape[1], 0.5), (0.02, 100.0))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # of hyperparameters at their bounds: an input without say
+        warnings.simplefilter("ignore", ConvergenceWarning)  # at a bound: an input without influence
         return _classifier()(kernel, optimizer=_searched).fit(inputs, passed)
 
 
@@ -203,7 +203,7 @@ def _latent(model: Any, inputs: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def _with_latent(cheap: Any, factors: NDArray, mean: NDArray | None = None) -> NDArray:
-    """Return what the dear check's classifier sees: the factors, and the mean latent value of the cheap one there."""
+    """Return the inputs of the expensive check's classifier: factors, and the mean latent value of the cheap one."""
     if mean is None:
         mean = _latent(cheap, factors)[0]
     return np.column_stack([factors, np.clip(mean, -_LATENT, _LATENT)])

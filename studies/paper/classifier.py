@@ -1,8 +1,8 @@
-"""A Gaussian process that classifies, by Laplace's approximation, and is refitted from where it is as samples come.
+"""A Gaussian process classifier by Laplace's approximation, with a warm start when samples are added.
 
 After C. E. Rasmussen, C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), algorithms 3.1 and 3.2. The
-kernel is given. Newton's method finds the latent values at the samples, of which there is one best set. Each step
-factors a matrix as large as there are samples, and from the values of the last fit far fewer are needed than from zero.
+kernel is given. Newton's method finds the latent values at the samples, a convex problem. Each step factors an N×N
+matrix for N samples, and starting at the values of the last fit takes far fewer steps than starting at zero.
 """
 
 from dataclasses import dataclass
@@ -14,31 +14,31 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.special import expit
 
 STEPS = 100  # of Newton's method, at most
-ENOUGH = 1e-10  # gain of log marginal likelihood at which it ends
-Kernel = Any  # of scikit-learn: callable on one or two sets of inputs, with `diag`
+ENOUGH = 1e-10  # gain of log marginal likelihood below which Newton's method ends
+Kernel = Any  # scikit-learn's: callable on one or two sets of inputs, with `diag`
 
 
 @dataclass(frozen=True, slots=True)
 class Classifier:
-    """What is known of which inputs pass: latent values, above 0 where passing is likely."""
+    """A fitted classifier: a latent value above 0 predicts that an input passes."""
 
     kernel: Kernel
     inputs: NDArray  # (N, D)
     passed: NDArray  # (N,) bool
-    values: NDArray  # (N,) latent, at the samples
-    slope: NDArray  # (N,) of the log likelihood there
-    root: NDArray  # (N,) of its curvature
+    values: NDArray  # (N,) latent values at the samples
+    slope: NDArray  # (N,) gradient of the log likelihood there
+    root: NDArray  # (N,) square root of its negative curvature
     factor: NDArray  # (N, N) lower Cholesky factor of 1 + root K root
 
     def latent_mean_and_variance(self, inputs: NDArray) -> tuple[NDArray, NDArray]:
-        """Return mean and variance of the latent values at inputs, (M, D); named as scikit-learn's."""
+        """Return mean and variance, (M,) each, of the latent values at inputs, (M, D); the name is scikit-learn's."""
         across = self.kernel(self.inputs, inputs)
         explained = solve_triangular(self.factor, self.root[:, None] * across, lower=True, check_finite=False)
         return across.T @ self.slope, self.kernel.diag(inputs) - np.einsum("ij,ij->j", explained, explained)
 
 
 def fit(kernel: Kernel, inputs: NDArray, passed: NDArray, begun: Classifier | None = None) -> Classifier:
-    """Return the classifier of these samples; `begun` is that of the first of them, from which the search starts."""
+    """Return the classifier of these samples; `begun`, a fit of the first of them, is the starting point."""
     values = np.zeros(len(inputs))
     if begun is not None:
         known = len(begun.inputs)

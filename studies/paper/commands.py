@@ -10,13 +10,13 @@ from studies.runner.commands import SCHEDULER, WORKERS, note, print_result, prog
 
 @click.command(epilog="Example: python -m studies paper results --workers 2")
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
-@click.option("--quick", is_flag=True, help="A few paths and epochs on data of their own: does all of it run?")
+@click.option("--quick", is_flag=True, help="Smoke test: a few paths and epochs, on data made for it.")
 @WORKERS
 @SCHEDULER
 def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> None:
-    """Make the results of all of the paper's tables in DIR, one study after the other.
+    """Make the results of all of the paper's tables in DIR, one study after another.
 
-    What is there already, of the same sources and settings, is kept, so that a run that was stopped goes on.
+    Results of the present sources and settings are kept, so that a run that was stopped resumes.
     """
     from studies.paper.all_tables import paper_results
 
@@ -33,7 +33,7 @@ def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> Non
 @click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
 @click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
 def figures(results: Path, images: Path) -> None:
-    """Draw the paper's figures as .png in IMAGES from the results in RESULTS, where the rows of their cases are."""
+    """Draw the paper's figures as .png in IMAGES from the rows of the cases in RESULTS."""
     from studies.paper.figures import write_figures
 
     for file, reason in write_figures(results, images):

@@ -1,10 +1,10 @@
-"""Minimum-jerk motion through a corridor of three oriented boxes, as AllocNet is given it in the paper.
+"""Minimum-jerk motion through a corridor of three oriented boxes, the input that the paper gives AllocNet.
 
 Y. Wu et al., "Deep Learning for Optimization of Trajectories for Quadrotors" (2024): safe corridors and segment times
 in, the polynomial that minimises jerk within them out. The paper (see toppquad.py) fits three boxes to evenly spaced
-sections of the min-snap path, oriented to each section, 0.75 m of room about it; the path itself is given up.
+sections of the min-snap path, aligned with each section and padded by 0.75 m; the path itself need not be followed.
 
-A segment is a quintic Bézier curve in its box, with its control points; position to jerk are continuous.
+A segment is a quintic Bézier curve whose control points lie in its box; position to jerk are continuous.
 """
 
 from dataclasses import dataclass
@@ -22,16 +22,16 @@ from cfplan.geometry.path import Path
 BOXES = 3
 PADDING = 0.75  # m from the path to any wall
 CONTROL_POINTS = 6  # of a quintic
-CONTINUOUS = 3  # order of the highest derivative that does not jump between segments
-SPEED, ACCELERATION = 5.0, 6.0  # m/s of the paper's simulations; m/s² that AllocNet's public weights were trained for
+CONTINUOUS = 3  # order of the highest derivative that is continuous between segments
+SPEED, ACCELERATION = 5.0, 6.0  # m/s, of the paper's simulations; m/s², of AllocNet's public weights
 _SECTION_SAMPLES = 60
-_SAMPLES = 40  # of a segment, where speed and acceleration are looked at
+_SAMPLES = 40  # samples of a segment at which speed and acceleration are evaluated
 _ORDER = CONTROL_POINTS - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corridor:
-    """Oriented boxes one after the other, from a point to a point."""
+    """A sequence of oriented boxes from a start to a goal."""
 
     start: NDArray  # (3,) m
     goal: NDArray  # (3,) m
@@ -41,7 +41,7 @@ class Corridor:
 
 
 def corridor_about(path: Path) -> Corridor:
-    """Return the boxes about evenly spaced sections of a path."""
+    """Return the boxes around evenly spaced sections of a path."""
     edges = np.linspace(0.0, path.end, BOXES + 1)
     axes, low, high = [], [], []
     for begin, end in pairwise(edges):
@@ -55,7 +55,7 @@ def corridor_about(path: Path) -> Corridor:
 
 
 def box_corners(corridor: Corridor) -> NDArray:
-    """Return the corners of each box, (B, 8, 3) m; bit k of a corner's number says which side along axis k."""
+    """Return the corners of each box, (B, 8, 3) m; bit k of a corner's index selects the side along axis k."""
     sides = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)])
     along = np.where(sides[None], corridor.high[:, None], corridor.low[:, None])
     return np.asarray(np.einsum("bij,bcj->bci", corridor.axes, along))
@@ -64,13 +64,13 @@ def box_corners(corridor: Corridor) -> NDArray:
 def min_jerk(corridor: Corridor, times: NDArray) -> NDArray:
     """Return the control points, (B, 6, 3) m, of the motion with the least ∫|jerk|² dt for segment times, (B,) s.
 
-    It starts and ends at rest. Raises InfeasibleError where no such motion stays in the boxes.
+    It starts and ends at rest. Raises InfeasibleError if no such motion stays in the boxes.
     """
     scale = float(np.sum(times))
     particular, free, hessian = _continuous_motions(tuple(np.round(times / scale, 12)))
     ends = np.stack([corridor.start, corridor.goal])
     offset = particular @ ends  # (18, 3)
-    count, size = free.shape  # of one axis
+    count, size = free.shape  # per axis
     linear = (free.T @ hessian @ offset).T.ravel()
     quadratic = np.kron(np.eye(3), free.T @ hessian @ free)
     rows = np.zeros((count * 3, 3 * size))
@@ -92,7 +92,7 @@ def min_jerk(corridor: Corridor, times: NDArray) -> NDArray:
 
 
 def timed_path(points: NDArray, times: NDArray) -> Path:
-    """Return the motion as a path whose s is time, s; at ds/dt = 1 it is flown as it was meant."""
+    """Return the motion as a path whose parameter s is time, s; at ds/dt = 1 it is flown with its own timing."""
     breaks = np.concatenate([[0.0], np.cumsum(times)])
     powers = np.stack([_powers() @ own for own in points])  # (B, 6, 3) of u = t / T
     powers /= times[:, None, None] ** np.arange(CONTROL_POINTS)[:, None]
@@ -101,7 +101,7 @@ def timed_path(points: NDArray, times: NDArray) -> Path:
 
 
 def least_time(points: NDArray, times: NDArray) -> float:
-    """Return the least factor on times that keeps SPEED and ACCELERATION along a motion, if its shape stays."""
+    """Return the least factor on times that keeps SPEED and ACCELERATION along a motion of unchanged shape."""
     speed, acceleration = 0.0, 0.0
     for own, seconds in zip(points, times, strict=True):
         first = _ORDER * np.diff(own, axis=0) / seconds
@@ -113,9 +113,10 @@ def least_time(points: NDArray, times: NDArray) -> float:
 
 @lru_cache(maxsize=64)
 def _continuous_motions(times: tuple[float, ...]) -> tuple[NDArray, NDArray, NDArray]:
-    """Return a motion of one axis for each end at 1, (18, 2), those that may be added, (18, F), and its jerk, (18, 18).
+    """Return a basis of the continuous motions of one axis, and their cost.
 
-    All are continuous and at rest at both ends; what may be added is zero there.
+    A motion is particular @ ends + free @ x: `particular`, (18, 2), has one end at 1 and the other at 0; `free`,
+    (18, F), is zero at both ends. All are at rest at both ends. The cost matrix, (18, 18), gives ∫|jerk|² dt.
     """
     count = BOXES * CONTROL_POINTS
     rows, wanted = [], []

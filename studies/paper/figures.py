@@ -1,4 +1,4 @@
-"""The paper's figures, drawn from the rows of results: paths of the baselines with AllocNet's boxes, yaw, tracks."""
+"""Draw the paper's figures from the rows of results: baselines' paths with AllocNet's boxes, yaw, flown tracks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -28,13 +28,13 @@ DIFFERENCES = (("h", "largest Δh"), ("time", "Δtime, s"), ("yaw", "largest Δy
 BINS = 20
 NETWORKS = MappingProxyType({"LSTM-0.001": "#7b3fa0", "LSTM-0.01": "#1f7a4d", "LSTM-0.1": "#c0282b"})  # as in the paper
 TOPPQUAD_STYLE = MappingProxyType({"color": "#2b5fc0", "ls": "--", "zorder": 2})
-PANELS = 4  # of tracks, in a line
+PANELS = 4  # panels of tracks in a row
 EDGES = tuple((corner, corner | 1 << axis) for corner in range(8) for axis in range(3) if not corner & 1 << axis)
-PATH_POINTS = 121  # of a path that was to be flown
+PATH_POINTS = 121  # points of a planned path
 
 
 class Drawing(NamedTuple):
-    """One figure: the study from whose rows it is drawn, what a row is, and how they are drawn."""
+    """One figure: the study whose rows it shows, the type of a row, and the function that draws them."""
 
     study: str
     row: type
@@ -42,16 +42,16 @@ class Drawing(NamedTuple):
 
 
 class Written(NamedTuple):
-    """What became of a figure."""
+    """A figure that was written or left out."""
 
     file: Path
-    left_out: str  # why there is none; empty where it was drawn
+    left_out: str  # why it was left out; empty if it was written
 
 
 def write_figures(results: Path, images: Path) -> list[Written]:
-    """Draw each of FIGURES from the rows beside the results in one folder, into the other.
+    """Draw each of FIGURES from the rows in `results`, and write it to `images`.
 
-    Those without rows, which are not kept in the repository, are left out.
+    Figures without rows are left out; rows are not kept in the repository.
 
     Raises:
         InputError: no such folder, or a figure that cannot be written.
@@ -72,7 +72,7 @@ def write_figures(results: Path, images: Path) -> list[Written]:
 
 
 def _read_rows(results: Path, study: str, row: type) -> list[Any]:
-    """Return the rows of a study's cases. Raises InputError, with the command that makes them, where there are none."""
+    """Return the rows of a study's cases. Raises InputError, with the command that makes them, if there are none."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -86,7 +86,7 @@ def _read_rows(results: Path, study: str, row: type) -> list[Any]:
 
 
 def draw_baselines(rows: Sequence[BaselineTrial]) -> "Figure":
-    """Draw the paths of a row of planners through the same waypoints, and the boxes that AllocNet's kind is given."""
+    """Draw the planners' paths through the same waypoints, and the boxes of the AllocNet baseline."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
@@ -111,7 +111,7 @@ def _draw_motion(axes: Any, name: str, motions: Mapping[str, NDArray], seed: int
     waypoints, boxes = course.waypoints, box_corners(corridor_about(course.path))
     everything = np.concatenate([waypoints, *motions.values(), *boxes])
     if name == ALLOCATION:
-        waypoints = waypoints[[0, -1]]  # it keeps no other
+        waypoints = waypoints[[0, -1]]  # it passes only these
         for box in boxes:
             for edge in EDGES:
                 axes.plot(*box[list(edge)].T, color="0.55", lw=0.7)
@@ -130,7 +130,7 @@ def _draw_motion(axes: Any, name: str, motions: Mapping[str, NDArray], seed: int
 
 
 def draw_yaw_consistency(rows: Sequence[Pair]) -> "Figure":
-    """Draw the histograms of the largest differences within pairs of paths, a row for each way to plan them."""
+    """Draw histograms of the largest differences within pairs of paths, one row per planner."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
@@ -149,7 +149,7 @@ def draw_yaw_consistency(rows: Sequence[Pair]) -> "Figure":
 
 
 def draw_tracks(rows: Sequence[HardwareFlight], network: str) -> "Figure":
-    """Draw the flights of a network and of TOPPQuad over their paths, from above: as planned, then certified."""
+    """Draw the flights of a network and of TOPPQuad over their paths from above: as planned, then certified."""
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row.limits == TRACKED and row.path != LONG and row.planner in (TOPPQUAD, network)]
@@ -177,7 +177,7 @@ def draw_tracks(rows: Sequence[HardwareFlight], network: str) -> "Figure":
 
 
 def draw_long(rows: Sequence[HardwareFlight]) -> "Figure":
-    """Draw the flights over the long path, certified, from above and from the side: the planner's that ships."""
+    """Draw the shipped planner's certified flights over the long path, from above and from the side."""
     from matplotlib.figure import Figure
 
     flights = [row for row in rows if (row.limits, row.path, row.way) == (TRACKED, LONG, CERTIFIED)]
@@ -201,12 +201,12 @@ def draw_long(rows: Sequence[HardwareFlight]) -> "Figure":
 
 
 def _places(path: PathOfMotion) -> NDArray:
-    """Return where a path goes, (PATH_POINTS, 3) m."""
+    """Return points along a path, (PATH_POINTS, 3) m."""
     return path(np.linspace(0.0, path.end, PATH_POINTS))
 
 
 def _track(flight: HardwareFlight) -> NDArray:
-    """Return where a flight was, (N, 3) m."""
+    """Return the recorded positions of a flight, (N, 3) m."""
     return np.reshape(flight.points, (-1, 3)) / 1000.0
 
 

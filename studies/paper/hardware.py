@@ -1,10 +1,10 @@
-"""Make the paper's hardware tables on the virtual lab, without real time: TOPPQuad, networks and what ships.
+"""Make the paper's hardware tables in the stepped lab: TOPPQuad, networks and the shipped planner.
 
-Eight paths in a motion capture room, the first a straight line, and a long one; several flights of each, which differ
-by the noise of sensors, cameras and radio. The paper states two sets of limits, so there are two. Plans are flown in
-two ways: as they are, which cfplan otherwise refuses, and certified, as cfplan flies them. Room, vehicle and all other
-limits are those that `cfplan init` writes. Paths are labelled and networks trained where they are not there, for each
-set of limits in its own folder; what was stopped goes on. Of the first set the poses are kept, for the figures.
+There are eight paths in a motion capture room, the first a straight line, and a long one, with several flights of each
+that differ in the noise of sensors, cameras and radio. The paper states two sets of limits, and both are used. Flights
+are as planned, which cfplan otherwise refuses, and certified, as cfplan flies them. Room, vehicle and all other limits
+are those that `cfplan init` writes. Missing datasets and networks are made, in one folder per set of
+limits; interrupted work resumes. Poses are kept for the first set, for the figures.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -69,15 +69,15 @@ from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-DATA = FilePath("datasets/paper-hardware")  # a folder for each set of limits, with its dataset and its networks
-NOISES = (0.001, 0.01, 0.1)  # m, of the LSTMs that the paper flew
+DATA = FilePath("datasets/paper-hardware")  # one folder per set of limits, with its dataset and networks
+NOISES = (0.001, 0.01, 0.1)  # m, noise injected in training the LSTMs that the paper flew
 SHIPPED = "the shipped planner"
 TOPPQUAD_FLIGHTS, LEARNED_FLIGHTS = 4, 5  # of each path
 LOSS = 0.05  # of radio packets
 LINE, LONG = "1", "long"
 THE_LINE = np.array([[-1.4, -2.8, 0.8], [1.4, 2.8, 1.2]])  # m
-LONG_WAYPOINTS, LONG_WALL_DISTANCE = 16, 0.35  # of the long path, and m that they keep from the margin
-LIMITS = {"appendix": (5.0, 8.0), "text": (10.0, 10.0)}  # m/s² and rad/s, as the paper has them in the two places
+LONG_WAYPOINTS, LONG_WALL_DISTANCE = 16, 0.35  # number of waypoints, and m that they keep from the margin
+LIMITS = {"appendix": (5.0, 8.0), "text": (10.0, 10.0)}  # m/s² and rad/s, by where the paper states them
 RAW, CERTIFIED = "as planned", "certified"
 TRACKED = next(iter(LIMITS))  # the limits whose flights are drawn
 TRACK_SPACING = 0.1  # s between two kept poses
@@ -85,11 +85,11 @@ TRACK_SPACING = 0.1  # s between two kept poses
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which paths are flown, and what the networks learn from."""
+    """The paths to fly, and the training of the networks."""
 
     paths: int = option(8, "Paths in the room, the first a straight line; the long one is flown besides.", least=1)
     learned_from: int = option(9000, "Paths that networks learn from, for each set of limits.", least=10)
-    data: FilePath = option(DATA, "Folder of paths and networks; others are made.")
+    data: FilePath = option(DATA, "Folder of datasets and networks; missing ones are made.")
     epochs: int | None = option(None, EPOCHS, least=1)
     quick: bool = option(False, QUICK)
 
@@ -105,14 +105,14 @@ class HardwareFlight:
     trial: int
     reason: str = ""  # why there is no flight, or why it did not land at the end of its path
     travel_time: float = np.nan  # s, planned
-    deviation: float = np.nan  # m, largest by the poses, from where the setpoint is at that time
-    settled: float = np.nan  # s after the end of the motion; inf where it did not settle
-    points: list[list[int]] = field(default_factory=list)  # mm, where it was along the path, where that is drawn
+    deviation: float = np.nan  # m, largest distance of the poses from the setpoint of the same time
+    settled: float = np.nan  # s after the end of the motion; inf if it did not settle
+    points: list[list[int]] = field(default_factory=list)  # mm, poses along the path, if the figure shows them
     training: Mapping[str, Any] | None = None  # of the network that planned
 
 
 class _Poses:
-    """Keeps some poses of those that arrive while the path is flown."""
+    """Keeps a pose every TRACK_SPACING while the path is flown."""
 
     def __init__(self) -> None:
         self.points: list[list[int]] = []
@@ -128,9 +128,9 @@ class _Poses:
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a plan, which is flown several times; paths are labelled and networks trained if need be.
+    """Return one case per plan, which is flown several times; datasets and networks are made if necessary.
 
-    Raises InputError where the folder holds other data or networks.
+    Raises InputError if the folder holds other data or networks.
     """
     usual = load_limits(DEFAULTS)
     paths = hardware_paths(usual, settings.paths) | ({} if settings.quick else {LONG: long_path(usual)})
@@ -159,7 +159,7 @@ def _networks(settings: Settings, run: Run, name: str) -> dict[str, TrainedNetwo
 
 
 def paper_limits(usual: Limits, name: str) -> Limits:
-    """Return the limits with those of the paper in them, and thresholds of flight above them."""
+    """Return `usual` with the paper's plan limits, and flight limits raised to stay above them."""
     acceleration, angular_velocity = LIMITS[name]
     flight = usual.flight
     return replace(
@@ -174,13 +174,13 @@ def paper_limits(usual: Limits, name: str) -> Limits:
 
 
 def _above(planned: float, ladder: Ladder) -> Ladder:
-    """Return thresholds of which the first is half as high again as what is planned, at least."""
+    """Return the ladder, scaled up if necessary so that braking begins at no less than 1.5 times the planned value."""
     factor = max(1.0, 1.5 * planned / ladder.brake)
     return Ladder(factor * ladder.brake, factor * ladder.land, factor * ladder.cut)
 
 
 def hardware_spec(limits: Limits, learned_from: int) -> DatasetSpec:
-    """Return the paths that the networks learn from: the paper's, from its training box."""
+    """Return the spec of the dataset that the networks learn from: the paper's paths, in its training box."""
     return DatasetSpec(
         count=learned_from, seed=1, limits=GIVEN, airframe=limits.airframe, plan=limits.plan, families=(),
         boxes=(BOXES["10x10x10"],), waypoints=(WAYPOINTS, WAYPOINTS), nodes=NODES, yaw=YawMode.FREE,
@@ -188,18 +188,18 @@ def hardware_spec(limits: Limits, learned_from: int) -> DatasetSpec:
 
 
 def hardware_paths(limits: Limits, number: int) -> dict[str, Path]:
-    """Return paths that stay within the room, the first a straight line, by the names of the tables."""
+    """Return paths within the room, the first a straight line, by their names in the tables."""
     paths = [min_snap(THE_LINE), *(path for _, path in random_paths(limits, 0, number - 1))]
     return {str(k): path for k, path in enumerate(paths, start=1)}
 
 
 def long_path(limits: Limits) -> Path:
-    """Return a path several times as long that stays within the room."""
+    """Return a path within the room that is several times as long."""
     distance = limits.space.margin + LONG_WALL_DISTANCE
     box = np.array([limits.space.low, limits.space.high]) + np.array([[distance], [-distance]])
     for seed in numbers():
         path = min_snap(random_waypoints(seed, box, (LONG_WAYPOINTS, LONG_WAYPOINTS)))
-        with suppress(CfplanError):  # between its waypoints it leaves the space, or has a cusp
+        with suppress(CfplanError):  # the path leaves the space between its waypoints, or has a cusp
             path.check()
             check_space(path, limits.space)
             return path
@@ -215,11 +215,11 @@ class FlownPlan(NamedTuple):
     path: str
 
 
-Networks = Mapping[str, Mapping[str, TrainedNetwork]]  # by the names of limits and their own
+Networks = Mapping[str, Mapping[str, TrainedNetwork]]  # by limits and name
 
 
 def plans_of(networks: Networks, paths: Iterable[str]) -> dict[str, FlownPlan]:
-    """Return what is planned, by the names of the cases: networks plan no long path, and what ships none as it is."""
+    """Return the plans by case name. Networks do not plan the long path; the shipped planner only flies certified."""
     plans = [
         FlownPlan(limits, way, planner, path)
         for limits, own in networks.items()
@@ -232,7 +232,7 @@ def plans_of(networks: Networks, paths: Iterable[str]) -> dict[str, FlownPlan]:
 
 
 def measure(networks: Networks, paths: Mapping[str, Path], most: int, asked: FlownPlan) -> list[HardwareFlight]:
-    """Plan once, and fly that as often as the paper, at most `most` times."""
+    """Plan once, and fly the plan as often as the paper does, at most `most` times."""
     network, limits = networks[asked.limits].get(asked.planner), paper_limits(load_limits(DEFAULTS), asked.limits)
     flights = min(most, TOPPQUAD_FLIGHTS if asked.planner == TOPPQUAD else LEARNED_FLIGHTS)
     training = network.training if network else None
@@ -241,7 +241,7 @@ def measure(networks: Networks, paths: Mapping[str, Path], most: int, asked: Flo
         encoded, trajectory = encoded_plan(asked.way, asked.planner, network, paths[asked.path], limits)
     except CfplanError as error:
         return [replace(flight, reason=str(error)) for flight in begun]
-    if asked.way == RAW:  # the paper's flights have no other end than a crash: here the pilot ends those that are LOST
+    if asked.way == RAW:  # the pilot ends flights that are LOST; in the paper they crash
         limits = replace(limits, flight=replace(limits.flight, deviation=Ladder(LOST, 1.5 * LOST, 2.0 * LOST)))
     mission, seed = mission_of(encoded, limits), 10 * list(paths).index(asked.path)
     return [_flown(replace(flight, travel_time=trajectory.duration), mission, seed + flight.trial) for flight in begun]
@@ -250,7 +250,7 @@ def measure(networks: Networks, paths: Mapping[str, Path], most: int, asked: Flo
 def encoded_plan(
     way: str, planner: str, network: TrainedNetwork | None, path: Path, limits: Limits
 ) -> tuple[EncodedFlight, Trajectory]:
-    """Return what is flown of a plan by TOPPQuad, a network or the planner that ships. Raises CfplanError."""
+    """Plan with TOPPQuad, a network or the shipped planner, and encode the flight. Raises CfplanError."""
     task = PlanningTask(path, limits.airframe, limits.plan, max(NODES, default_nodes(path)), YawMode.FREE)
     if way == RAW:
         profile = network_plan(network)(path) if network else profile_of(plan_toppquad, task)
@@ -272,7 +272,7 @@ def encoded_plan(
 
 
 def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFlight:
-    """Return what became of it."""
+    """Fly a mission in the stepped lab, and return the flight with its results."""
     lossy = (RadioFault(RadioFaultKind.LOSS, 0.0, FOR_GOOD, LOSS),)
     vehicle = VehicleSettings(auto_arming=False, seed=seed)
     scenario, poses = Scenario("", Rung.NONE, lossy, from_start=True, vehicle=vehicle), _Poses()
@@ -286,7 +286,7 @@ def _flown(flight: HardwareFlight, mission: Mission, seed: int) -> HardwareFligh
 
 
 def _is_drawn(flight: HardwareFlight) -> bool:
-    """Return whether the paper draws it: flights of TOPPQuad and of networks; of what ships, that of the long path."""
+    """Return whether a figure shows the flight: TOPPQuad's, a network's, or the shipped planner's on the long path."""
     return flight.limits == TRACKED and (flight.planner != SHIPPED or flight.path == LONG)
 
 
@@ -310,7 +310,7 @@ COLUMNS = (
 
 
 def tables(settings: Settings, rows: list[HardwareFlight]) -> Iterator[Table]:
-    """Yield the paper's table, the same of the straight line and of the long path alone, and the trainings."""
+    """Yield the paper's table, the same for the straight line and the long path alone, and the trainings."""
     number = len({row.path for row in rows} - {LONG})
     pairs = ", ".join(f"{name} {first:g} m/s² and {second:g} rad/s" for name, (first, second) in LIMITS.items())
     title = f"{number} paths in the room, 2 m/s; limits: {pairs}"

@@ -1,4 +1,4 @@
-"""Make the paper's table of inputs: an LSTM that sees position, velocity and acceleration of a path, or less."""
+"""Make the paper's table of inputs: LSTMs that see all or some of a path's position, velocity and acceleration."""
 
 from collections.abc import Iterator
 from functools import partial
@@ -21,14 +21,14 @@ from studies.runner.study import Run, Study, Work
 
 
 def work(settings: NetworkSettings, run: Run) -> Work:
-    """Return a case a path; networks are trained if need be. Raises what `paper_data` raises."""
+    """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
     data = paper_data(settings, run, [SequenceOptions(inputs=inputs) for inputs in Inputs])
     networks = {each.options.inputs.value: each for each in data.networks}
     return Work(data.paths, partial(measure, networks), PaperTrial, data.identity)
 
 
 def measure(networks: dict[str, TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
-    """Ask TOPPQuad and each network about a path."""
+    """Plan a path with TOPPQuad and each network."""
     plans = {TOPPQUAD: planners([])[TOPPQUAD]} | {name: network_plan(each) for name, each in networks.items()}
     return path_trials(plans, networks, asked)
 

@@ -1,10 +1,11 @@
 """The networks of the paper's Table 1 in torch: LSTM and Transformer encoder-decoders, an encoder, a per-step MLP.
 
 Each maps the derivatives of a path at N nodes, (B, N, I), to h and cos ψ there, (B, N, 2); means and scales are stored
-with the weights. Inside, h is its logarithm: at rest ends h is ten times and more what it is elsewhere, and would
-outweigh it. That, the sizes, and what the MLP sees are not in the paper: see `SIZES` and `REACH`.
+with the weights. The networks work with log h: h is more than ten times larger near ends at rest than elsewhere, and
+these ends would dominate the loss. The logarithm, the sizes, and the MLP's inputs are not in the paper: see `SIZES` and
+`REACH`.
 
-Where `answers` are given, the answer before is the true one (teacher forcing), else the network's.
+If `answers` are given, a node's previous answer is the true one (teacher forcing), else the network's.
 """
 
 import math
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor, nn
 
 OUTPUTS = 2  # h and cos ψ
-REACH = 8  # nodes on either side of its own that the MLP sees, and answers before its own that it is fed
+REACH = 8  # nodes on either side that the MLP sees, and number of previous answers that it is fed
 
 
 class Kind(StrEnum):
@@ -32,7 +33,7 @@ class Kind(StrEnum):
 
 
 class Size(NamedTuple):
-    """Width and number of layers, of each of encoder and decoder."""
+    """Width and number of layers, each for encoder and decoder."""
 
     width: int
     layers: int
@@ -42,11 +43,11 @@ SIZES = MappingProxyType({
     Kind.LSTM: Size(96, 1), Kind.TRANSFORMER: Size(64, 2), Kind.ENCODER: Size(64, 3), Kind.MLP: Size(192, 3),
 })  # fmt: skip
 HEADS = 4
-MOST_LOG = 10.0  # of h: farther out are no answers but accidents
+MOST_LOG = 10.0  # bound of |log h|: larger values are failures of the network
 
 
 class SequenceNetwork(nn.Module, ABC):
-    """What the networks have in common: the normalisation of what they see and say."""
+    """Base class of the networks: normalises inputs and outputs."""
 
     def __init__(self, inputs: int) -> None:
         super().__init__()
@@ -54,7 +55,7 @@ class SequenceNetwork(nn.Module, ABC):
         self.middle, self.spread = nn.Buffer(torch.zeros(OUTPUTS)), nn.Buffer(torch.ones(OUTPUTS))
 
     def set_units(self, inputs: Tensor, answers: Tensor) -> None:
-        """Take means and scales from data, (R, N, I) and (R, N, 2)."""
+        """Set means and scales from data, (R, N, I) and (R, N, 2)."""
         self.mean.copy_(inputs.mean((0, 1)))
         self.scale.copy_(inputs.std((0, 1)).clamp_min(1e-6))
         logs = _with_logarithm(answers)
@@ -69,16 +70,16 @@ class SequenceNetwork(nn.Module, ABC):
         return torch.stack([found[..., 0].clamp(-MOST_LOG, MOST_LOG).exp(), found[..., 1]], -1)
 
     def scaled(self, answers: Tensor) -> Tensor:
-        """Return answers as the network has them, in which errors are measured."""
+        """Return answers in normalised form, in which the loss is computed."""
         return (_with_logarithm(answers) - self.middle) / self.spread
 
     @abstractmethod
     def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
-        """Map what is scaled to what is scaled."""
+        """Map normalised inputs to normalised answers."""
 
 
 class LstmEncoderDecoder(SequenceNetwork):
-    """The paper's choice: attention between decoder and encoder has no parameters, answers are fed back."""
+    """The paper's choice: parameter-free attention from decoder to encoder, with answers fed back."""
 
     def __init__(self, inputs: int, size: Size) -> None:
         super().__init__(inputs)
@@ -106,7 +107,7 @@ class LstmEncoderDecoder(SequenceNetwork):
 
 
 class TransformerEncoderDecoder(SequenceNetwork):
-    """Self-attention over the path, a decoder with a causal mask and cross-attention, fed its answers."""
+    """Self-attention over the path, and a causally masked decoder with cross-attention that is fed its answers."""
 
     def __init__(self, inputs: int, size: Size) -> None:
         super().__init__(inputs)
@@ -157,7 +158,7 @@ class EncoderTransformer(SequenceNetwork):
 
 
 class StepMlp(SequenceNetwork):
-    """One node after the other: from the path within REACH nodes and the last REACH answers."""
+    """Answers node by node, from the path within REACH nodes and the last REACH answers."""
 
     def __init__(self, inputs: int, size: Size) -> None:
         super().__init__(inputs)
@@ -167,7 +168,7 @@ class StepMlp(SequenceNetwork):
 
     def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
         """See SequenceNetwork."""
-        there = torch.cat([seen, torch.ones_like(seen[..., :1])], 2)  # zeros where the path has ended
+        there = torch.cat([seen, torch.ones_like(seen[..., :1])], 2)  # marks nodes on the path; padding is 0
         around = nn.functional.pad(there, (0, 0, REACH, REACH)).unfold(1, 2 * REACH + 1, 1).flatten(2)
         before = seen.new_zeros(len(seen), REACH, OUTPUTS)
         if fed is not None:
@@ -187,7 +188,7 @@ _NETWORKS: dict[Kind, Callable[[int, Size], SequenceNetwork]] = {
 
 
 def build_network(kind: Kind, inputs: int, size: Size | None = None) -> SequenceNetwork:
-    """Return a network with random weights, by torch's seed."""
+    """Return a network with random weights from torch's generator."""
     return _NETWORKS[kind](inputs, size or SIZES[kind])
 
 
@@ -196,7 +197,7 @@ def _with_logarithm(answers: Tensor) -> Tensor:
 
 
 def placed(values: Tensor) -> Tensor:
-    """Add to (B, N, W) the sines and cosines by which attention knows a node's place."""
+    """Add sinusoidal positional encodings to (B, N, W)."""
     count, width = values.shape[1:]
     rates = torch.exp(torch.arange(0, width, 2) * (-math.log(1e4) / width))
     angles = torch.arange(count)[:, None] * rates

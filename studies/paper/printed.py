@@ -1,7 +1,7 @@
-"""What the paper prints, number by number: K. Mao et al., "Sequence Modeling for Time-Optimal Quadrotor Trajectory
+"""The numbers that the paper prints: K. Mao et al., "Sequence Modeling for Time-Optimal Quadrotor Trajectory
 Optimization with Sampling-based Robustness Analysis" (2025).
 
-SI units; fractions are at most 1. Where the paper prints one number for train and test, it stands under both.
+SI units; percentages are fractions. A number that the paper prints for train and test together is listed under both.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from studies.runner.result import Column
 def paper_column(
     rows: Mapping[Any, Any], number: str, by: tuple[str, ...], unit: str = "", spec: str = "", meaning: str = ""
 ) -> Column:
-    """Return the column of one of the paper's numbers, which a group has by its fields `by`, or has not."""
+    """Return the column of one of the paper's numbers, looked up by a group's fields `by`; empty if there is none."""
 
     def printed(group: Sequence[Any]) -> Any:
         key = tuple(getattr(group[0], field) for field in by)
@@ -28,13 +28,13 @@ class PrintedRow(NamedTuple):
 
     deviation: float  # m, "max dev"
     violation: float  # N, "thrust violation"
-    slower: float | None  # "TD ratio"; None for TOPPQuad, of which the travel time is printed
+    slower: float | None  # "TD ratio"; None for TOPPQuad, for which the paper prints the travel time
     failed: float  # fraction
     seconds: float | None = None  # "compute time"
 
 
 TRAIN, TEST = "train", "test"
-ABOVE_IN_TEXT = 0.023  # m, of the LSTM over TOPPQuad by the text; by Table 1 it is 0.021 (train) and 0.090 (test)
+ABOVE_IN_TEXT = 0.023  # m, excess of the LSTM over TOPPQuad in the text; Table 1 gives 0.021 (train) and 0.090 (test)
 
 # Table 1, "Ablation study on model architectures", by its columns.
 ARCHITECTURES = MappingProxyType({
@@ -95,7 +95,7 @@ class PrintedHardware(NamedTuple):
     time: float  # s, with settling
 
 
-# The hardware table, and that of the appendix, "Noised Model Hardware Experiments", where the first two stand again.
+# The hardware table, and that of the appendix, "Noised Model Hardware Experiments", which repeats the first two.
 HARDWARE = MappingProxyType({
     "TOPPQuad": PrintedHardware(0.347, 7.981),
     "LSTM-0.001": PrintedHardware(0.355, 8.355),
@@ -123,8 +123,8 @@ class PrintedBaseline(NamedTuple):
         return f"{self.thrust_least:g} / {self.thrust_most:g}"
 
 
-# Table 3, the comparison with baselines, by its columns. What the paper calls AllocNet and MFBOTrajectory are these
-# packages themselves.
+# Table 3, the comparison with baselines, by its columns. The paper ran the AllocNet and MFBOTrajectory packages
+# themselves.
 BASELINES = MappingProxyType({
     "TOPPQuad": PrintedBaseline(0.039, 0.05, 0.14, 0.000, 5.687, 19.772, 3.477, 0.0, 10.083),
     "LSTM": PrintedBaseline(0.124, 0.03, 0.16, 0.002, 5.653, 19.772, 3.498, 0.0, 0.069),

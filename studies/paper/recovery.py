@@ -1,7 +1,7 @@
-"""Trajectory recovery: from h and cos ψ at the nodes to a speed profile, as the paper's appendix has it.
+"""Trajectory recovery: from h and cos ψ at the nodes to a speed profile, as in the paper's appendix.
 
-What the cosine loses, the sign of ψ, is chosen so that yaw goes on as it turns. The paper differentiates h by finite
-differences; here both become the splines of a speed profile, so that attitude, rates and thrusts follow by flatness.
+The sign of ψ, which the cosine loses, is chosen so that yaw continues its turn. The paper differentiates h by finite
+differences; here both become the splines of a speed profile, so that flatness gives attitude, rates and thrusts.
 """
 
 import numpy as np
@@ -12,15 +12,15 @@ from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.profile_spline import profile_through
 from cfplan.vehicle.timing import duration_of
 
-LEAST_H = 1e-2  # to which answers are raised: less is no motion
-H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)  # the first whose spline stays above zero
+LEAST_H = 1e-2  # lower bound of answers: less is no motion
+H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)  # tried in order until the spline stays positive
 YAW_STIFFNESS = 1.0
 
 
 def recover_profile(answers: NDArray, end: float) -> SpeedProfile:
-    """Return the profile of h and cos ψ, (N, 2), at nodes from 0 to `end`.
+    """Return the speed profile through h and cos ψ, (N, 2), at nodes from 0 to `end`.
 
-    Raises NotCertifiedError where an answer is not finite, or no spline through h stays positive.
+    Raises NotCertifiedError if an answer is not finite, or no spline through h stays positive.
     """
     if not np.isfinite(answers).all():
         raise NotCertifiedError("not a number", where="the network's answer", hint="train it anew")
@@ -37,7 +37,7 @@ def recover_profile(answers: NDArray, end: float) -> SpeedProfile:
 
 
 def yaw_of_cosines(cosines: NDArray) -> NDArray:
-    """Return (N,) rad, from cos ψ: in [0, π] at first, then of both signs the one nearer to where yaw was turning."""
+    """Return yaw, (N,) rad, from cos ψ: first in [0, π], then the solution nearest to the linear extrapolation."""
     sizes = np.arccos(np.clip(cosines.astype(float), -1.0, 1.0))
     yaw = sizes.copy()
     for n in range(1, len(yaw)):

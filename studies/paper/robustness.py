@@ -1,9 +1,9 @@
-"""Make the paper's Table 2: networks and the planner that ships, asked about perturbed paths.
+"""Make the paper's Table 2: networks and the shipped planner on perturbed paths.
 
-For each path and each of its perturbations by at most ε: the plan is flown by the geometric controller with the paper's
-motor lag. Beside the networks, as they are: the planner that ships, certified, in each mode of yaw, the expert and
-TOPPQuad. One network is not in the paper: it learns from perturbed paths with labels of their own, where the paper
-keeps the clean path's.
+Each path, and each of its perturbations by at most ε, is planned, and the geometric controller flies the plan with the
+paper's motor lag. The networks, without repair, are compared with the shipped planner, certified, in each yaw mode, the
+expert and TOPPQuad. One network is not in the paper: it learns from perturbed paths that are solved again, whereas the
+paper keeps the clean path's label.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -71,15 +71,15 @@ REFERENCES: Mapping[str, Planner] = MappingProxyType({"toppquad": plan_toppquad,
 
 
 class Answered(NamedTuple):
-    """What a model answers: a profile, and h and cos ψ at the nodes, which is all that a network says."""
+    """A model's answer: a profile, and h and cos ψ at the nodes, which are a network's outputs."""
 
     profile: SpeedProfile
     h: NDArray  # (N,)
     cosine: NDArray  # (N,)
-    speed: NDArray  # (N,) m/s, along the path that it was asked about
+    speed: NDArray  # (N,) m/s, along the path of the request
 
 
-Ask = Callable[[Path], Answered]  # raises CfplanError where there is no answer
+Ask = Callable[[Path], Answered]  # raises CfplanError if there is no answer
 
 
 def _planner(plan: Plan) -> Ask:
@@ -95,7 +95,7 @@ def _answer(profile: SpeedProfile, path: Path, h: NDArray, cosine: NDArray) -> A
     return Answered(profile, h, cosine, np.linalg.norm(path(places, 1), axis=1) * np.sqrt(h))
 
 
-PLANNERS: Mapping[str, tuple[str, Ask]] = MappingProxyType(  # besides the networks: their names in tables
+PLANNERS: Mapping[str, tuple[str, Ask]] = MappingProxyType(  # besides the networks, with their names in tables
     {
         "shipped": (SHIPPED, _planner(shipped_profile)),
         "shipped-fixed": (SHIPPED_FIXED, _planner(partial(shipped_profile, yaw=YawMode.FIXED))),
@@ -104,33 +104,33 @@ PLANNERS: Mapping[str, tuple[str, Ask]] = MappingProxyType(  # besides the netwo
         "toppquad": (TOPPQUAD, _planner(profile_by(plan_toppquad))),
     }
 )
-USUAL = (*MODELS, *(name for name in PLANNERS if name != "toppquad"))  # that takes 18 s a path, all others 10
+USUAL = (*MODELS, *(name for name in PLANNERS if name != "toppquad"))  # TOPPQuad alone takes 18 s per path, these 10 s
 
 
 @dataclass(frozen=True, slots=True)
 class Settings(NetworkSettings):
-    """Which models are asked, about which paths."""
+    """The models to compare, and the paths."""
 
     paths: int = option(100, "Paths for testing.", least=1)
-    draws: int = option(10, "Perturbations of each path, each ε.", least=1)
+    draws: int = option(10, "Perturbations of each path, for each ε.", least=1)
     models: tuple[str, ...] = option(USUAL, "Network or planner.", choices=(*MODELS, *PLANNERS))
     reference: str = option(
         "toppquad", "Reference planner for travel times, on the path and on the perturbed one.",
         choices=tuple(REFERENCES),
     )  # fmt: skip
     reference_draws: int | None = option(
-        None, "Draws that the reference plans too, which takes the most time.  [default: all]", least=1
+        None, "Draws that the reference plans too; takes most of the time.  [default: all]", least=1
     )
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path for testing; networks are trained if need be. Raises what `paper_data` raises."""
+    """Return one case per test path; networks are trained if necessary. Raises what `paper_data` raises."""
     data = paper_data(settings, run, [MODELS[name] for name in settings.models if name in MODELS])
     return Work(data.part(TEST), partial(measure, settings, data.networks), RobustnessTrial, data.identity)
 
 
 def measure(settings: Settings, networks: list[TrainedNetwork], item: PaperPath) -> list[RobustnessTrial]:
-    """Ask each model about the path and about each of its perturbations."""
+    """Plan the path and each of its perturbations with each model."""
     _, row, path = item
     asked = {each.name: _network(each) for each in networks}
     asked |= dict(PLANNERS[name] for name in settings.models if name in PLANNERS)
@@ -179,7 +179,7 @@ def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Ans
 
 
 def _answered(ask: Ask, path: Path) -> Answered | str:
-    """Return the answer, or why there is none."""
+    """Return the answer, or the reason why there is none."""
     try:
         return ask(path)
     except CfplanError as error:

@@ -1,4 +1,4 @@
-"""The tables of the study of perturbed paths (robustness.py beside it): the paper's Table 2, and how answers vary."""
+"""The tables of the study robustness.py: the paper's Table 2, and the variation of the answers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,18 +27,18 @@ class RobustnessTrial:
     epsilon: float  # m
     row: int  # of the dataset
     draw: int
-    reason: str = ""  # why there is no flight
+    reason: str = ""  # why there is no flight; empty if there is one
     travel_time: float = np.nan  # s
     own_time: float = np.nan  # s, of the reference on the same perturbed path
     clean_time: float = np.nan  # s, of the reference on the clean path
-    free_time: float = np.nan  # s, of SHIPPED on the same perturbed path; for HELD_YAW
+    free_time: float = np.nan  # s, of SHIPPED on the same perturbed path; only for HELD_YAW
     deviation: float = np.nan  # m, LOST where it failed
-    h_variation: float = np.nan  # largest difference of h from that on the clean path
+    h_variation: float = np.nan  # largest difference of h from the answer along the clean path
     h_relative: float = np.nan  # the same, relative
     speed_variation: float = np.nan  # m/s, likewise of the speed at a node
     cosine_variation: float = np.nan  # largest difference of cos ψ
     reached: Sequence[float] = (0.0,) * len(TOLERANCES)
-    """Fraction of planned states that are reached in the time before them, by tolerance."""
+    """Fraction of planned states that are reached from the previous one in the planned time, by tolerance."""
     training: Mapping[str, Any] | None = None  # of the network that planned
 
 
@@ -55,7 +55,7 @@ _paper = partial(paper_column, ROBUSTNESS, by=("model", "epsilon"))
 
 
 def robustness_table(trials: Sequence[RobustnessTrial], reference: str) -> Table:
-    """Return the paper's Table 2 with the paper's numbers beside."""
+    """Return the paper's Table 2 beside the paper's numbers."""
     first, second, third = (f"{100 * place:g} cm, {100 * speed:g} cm/s" for place, speed in TOLERANCES)
     columns = (
         Column("model", "model"),
@@ -79,9 +79,10 @@ def robustness_table(trials: Sequence[RobustnessTrial], reference: str) -> Table
 
 
 def variation_table(trials: Sequence[RobustnessTrial]) -> Table:
-    """Return how far outputs are from those along the clean path: the largest difference at a node of each trial.
+    """Return the variation of outputs against the clean path: the largest difference at a node in each trial.
 
-    Of cos ψ also the largest of all draws of a path, mean over paths. Beside it, what a mode of yaw costs in time.
+    For cos ψ, also the largest over all draws of a path, averaged over paths. A further column is the time lost by
+    fixed or tangent yaw.
     """
     columns = (
         Column("model", "model"),

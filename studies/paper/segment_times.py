@@ -1,7 +1,7 @@
-"""Motions of allotted times: how a path whose s is time is flown, and MFBOTrajectory's kind, which times min-snap.
+"""Motions with given segment times: paths whose parameter is time, and a min-snap timing like MFBOTrajectory's.
 
-Its cheap check asks the flatness map whether the motors and 5 m/s are kept; its dear one flies the motion in closed
-loop, and asks whether it is followed, and flown within 5 m/s.
+The cheap check of that timing evaluates the flatness map: motors and the 5 m/s limit. The expensive check flies the
+motion in closed loop: it must be followed, within 5 m/s.
 """
 
 import numpy as np
@@ -17,20 +17,20 @@ from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.bayesian_times import Budget, optimise_times
 from studies.paper.trials import FLOWN, NODES
 
-FOLLOWED = 0.1  # m that a motion may be off in closed loop
-SAMPLE = 0.01  # s between the moments at which flatness is asked
+FOLLOWED = 0.1  # m, largest deviation in closed loop
+SAMPLE = 0.01  # s between evaluations of the flatness map
 QUICK_BUDGET = Budget(low=60, high=6, iterations=2, more_low=2)
 
 
 def timed_trajectory(timed: Path) -> Trajectory:
-    """Return the motion of a path whose s is time, s, with yaw 0."""
+    """Return the motion of a path whose parameter s is time, s, with yaw 0."""
     grid, zeros = np.linspace(0.0, timed.end, NODES + 1), np.zeros(NODES + 1)
     profile = SpeedProfile(grid, np.ones(NODES + 1), zeros, zeros, zeros[1:], zeros, zeros, zeros[1:])
     return Trajectory(timed, profile, PAPER.airframe)
 
 
 def bayesian_motion(waypoints: NDArray, *, budget: Budget, seed: int) -> Trajectory:
-    """Return the min-snap motion through waypoints, (K, 3) m, with the fastest times that the optimisation finds.
+    """Return the min-snap motion through waypoints, (K, 3) m, with the fastest segment times found.
 
     Raises:
         InfeasibleError: no uniform timing can be flown.
@@ -40,7 +40,7 @@ def bayesian_motion(waypoints: NDArray, *, budget: Budget, seed: int) -> Traject
     def motion(times: NDArray) -> Trajectory | None:
         try:
             return timed_trajectory(min_snap(waypoints, times=times))
-        except InputError:  # times so unequal that no smooth path joins the waypoints
+        except InputError:  # the times are too unequal for a smooth path
             return None
 
     def low(times: NDArray) -> bool:
@@ -57,7 +57,7 @@ def bayesian_motion(waypoints: NDArray, *, budget: Budget, seed: int) -> Traject
 
 
 def keeps_limits(planned: Trajectory) -> bool:
-    """Return whether the flatness map keeps the motors' range and the speed limit: the cheap check."""
+    """Return whether thrusts and speed stay within their limits by the flatness map: the cheap check."""
     state = planned.at(np.arange(0.0, planned.duration, SAMPLE))
     airframe, thrust = PAPER.airframe, state.motor_thrust
     within = airframe.motor_thrust_min <= thrust.min() and thrust.max() <= airframe.motor_thrust_max
@@ -65,6 +65,6 @@ def keeps_limits(planned: Trajectory) -> bool:
 
 
 def is_followed(planned: Trajectory) -> bool:
-    """Return whether it is followed in closed loop, and flown within the speed limit: the dear check."""
+    """Return whether a motion is followed in closed loop, within the speed limit: the expensive check."""
     followed = fly_geometric(planned, FLOWN)
     return followed.deviation <= FOLLOWED and followed.top_speed <= PAPER.limits.speed

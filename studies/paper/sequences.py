@@ -1,7 +1,7 @@
-"""Sequences: the paths of a dataset as the paper's networks see them, [γ, γ', γ''] at each node, with [h, cos ψ].
+"""Sequences: the paths of a dataset in the form of the paper's networks, [γ, γ', γ''] and [h, cos ψ] at each node.
 
-Nothing is scaled by limits or made relative to a place, as the features of cfplan's own networks are: the paper's
-networks know one vehicle, one set of limits and one box.
+Unlike the features of cfplan's own networks, they are not scaled by limits or relative to a position: the paper's
+networks are trained for one vehicle, one set of limits and one box.
 """
 
 from contextlib import suppress
@@ -20,11 +20,11 @@ from cfplan.learning.dataset_spec import DatasetSpec, Relabel
 from cfplan.learning.labels import solve
 from cfplan.planners.solution import Status
 
-MAX_LENGTH = 60.0  # m: the few longer paths are excursions of min-snap, far out of the box
+MAX_LENGTH = 60.0  # m: the few longer paths are min-snap paths that swing far out of the box
 
 
 class Inputs(StrEnum):
-    """What networks see of a path, as the paper's table of inputs names it."""
+    """The inputs of a network, named as in the paper's table of inputs."""
 
     ALL = "pos/vel/acc"
     VELOCITY = "pos/vel"
@@ -33,12 +33,12 @@ class Inputs(StrEnum):
 
     @property
     def orders(self) -> list[int]:
-        """Return the orders of the derivatives by s."""
+        """Return the orders of the derivatives with respect to s."""
         return [["pos", "vel", "acc"].index(name) for name in self.value.split("/")]
 
     @property
     def width(self) -> int:
-        """Return the numbers at a node."""
+        """Return the number of inputs per node."""
         return 3 * len(self.orders)
 
 
@@ -47,16 +47,16 @@ class Sequences:
     """R paths with their labels at N nodes."""
 
     spec: DatasetSpec
-    rows: NDArray  # (R,) numbers of the dataset's rows
+    rows: NDArray  # (R,) row numbers in the dataset
     paths: tuple[Path, ...]
     inputs: NDArray  # (R, N, 9) float32
     answers: NDArray  # (R, N, 2) float32, h and cos ψ
-    end: NDArray  # (R,) s where each path ends
+    end: NDArray  # (R,) path parameter s at each path's end
     length: NDArray  # (R,) m
     travel_time: NDArray  # (R,) s
 
     def part(self, chosen: NDArray | slice) -> "Sequences":
-        """Return some of the rows, by index."""
+        """Return the selected rows, by index."""
         numbers = np.arange(len(self.rows))[chosen]
         paths = tuple(self.paths[k] for k in numbers)
         return Sequences(
@@ -65,7 +65,7 @@ class Sequences:
         )  # fmt: skip
 
     def tested(self, count: int) -> "Sequences":
-        """Return the first `count` rows, from which nothing is learned."""
+        """Return the rows with number below `count`, which are reserved for testing."""
         return self.part(self.rows < count)
 
     def learned_from(self, first: int) -> "Sequences":
@@ -75,9 +75,9 @@ class Sequences:
     def perturbed_by(
         self, epsilon: float, seed: np.random.SeedSequence, relabel: Relabel = Relabel.KEEP
     ) -> "Sequences":
-        """Return every path perturbed by at most epsilon, m, with the clean path's label or with its own solution.
+        """Return every path perturbed by at most `epsilon`, m, with the clean path's label or the perturbed path's own.
 
-        A perturbed path that has no solution keeps the clean path's label. Lengths and times are the clean path's.
+        A perturbed path without a solution keeps the clean path's label. Lengths and times are the clean path's.
         """
         noisy = tuple(
             perturbed(path, epsilon, own) for path, own in zip(self.paths, seed.spawn(len(self.paths)), strict=True)
@@ -87,10 +87,10 @@ class Sequences:
         return replace(self, paths=noisy, inputs=inputs, answers=answers)
 
     def _solved(self, paths: tuple[Path, ...]) -> NDArray:
-        """Return (R, N, 2): the answers of other paths, solved as these were."""
+        """Return the solutions of other paths, (R, N, 2), solved with the dataset's options."""
         answers = self.answers.copy()
         for k, path in enumerate(paths):
-            with suppress(CfplanError):  # a perturbed path has more pieces, at times too many for the nodes
+            with suppress(CfplanError):  # a perturbed path may have too many pieces for the nodes
                 profile = solve(self.spec, int(self.rows[k]) // (1 + self.spec.copies), path).profile
                 if profile is not None:
                     answers[k] = np.stack([profile.h, np.cos(profile.yaw)], axis=1)
@@ -98,20 +98,20 @@ class Sequences:
 
 
 def path_inputs(path: Path, nodes: int) -> NDArray:
-    """Return (N, 9) float32: γ, γ' and γ'' at N nodes, both ends counted."""
+    """Return γ, γ' and γ'' at N nodes including both ends, (N, 9) float32."""
     s = np.linspace(0.0, path.end, nodes)
     return np.concatenate([path(s, order) for order in range(3)], axis=1).astype(np.float32)
 
 
 def select_inputs(inputs: NDArray, chosen: Inputs) -> NDArray:
-    """Return (..., N, I) of (..., N, 9)."""
+    """Return the chosen inputs, (..., N, I), of (..., N, 9)."""
     return inputs[..., [3 * order + axis for order in chosen.orders for axis in range(3)]]
 
 
 def read_sequences(folder: FilePath, *, most: int | None = None) -> Sequences:
     """Read the solved paths among the first `most` rows of a dataset.
 
-    Raises InputError where the folder is no dataset, is damaged, or holds no solved path.
+    Raises InputError if the folder is not a dataset, is damaged, or holds no solved path.
     """
     spec, rows = read_dataset(folder)
     solved = [row for row in rows.slice(0, most).to_pylist() if row["status"] == Status.SOLVED.name]

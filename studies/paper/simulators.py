@@ -1,8 +1,8 @@
-"""Fly bytes of the paper's tables on bodies of RotorPy, with two motor lags, and of drone-models.
+"""Repeat flights of the paper's tables with the bodies of RotorPy, at two motor lags, and of drone-models.
 
-The paper flies in RotorPy. Here some flights of each kind of table are flown by RotorPy too, and by drone-models where
-it has numbers of the vehicle. Who flies is the same as in the table: the geometric controller, or the firmware's with
-the same bytes.
+The paper flies in RotorPy. This study flies a sample of each kind of table in RotorPy too, and in drone-models where it
+knows the vehicle. The controller is the same as in the table: the geometric one, or the firmware's with the same
+packets.
 """
 
 from collections.abc import Callable, Iterator
@@ -60,7 +60,7 @@ ROWS = (
 
 @dataclass(frozen=True, slots=True)
 class Settings(NetworkSettings):
-    """Which paths are flown."""
+    """The paths to fly."""
 
     paths: int = option(8, "Paths of each kind of table.", least=1)
 
@@ -76,25 +76,25 @@ class Asked(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class BodyFlight:
-    """One flight by one body; NaN where there was none."""
+    """One flight with one body; NaN where there was none."""
 
     table: str
     planner: str
     path: str
     body: str
-    reason: str = ""  # why there is no flight
+    reason: str = ""  # why there is no flight; empty if there is one
     deviation: float = np.nan  # m
     own_deviation: float = np.nan  # m, by cfplan's body with the same motor lag
     apart: float = np.nan  # m, largest distance of the two at the same time
 
     @property
     def own_failed(self) -> bool:
-        """Return whether it was LOST by cfplan's body, or there was none."""
+        """Return whether the flight with cfplan's body was LOST or missing."""
         return not self.own_deviation < LOST
 
     @property
     def both_flown(self) -> bool:
-        """Return whether it was LOST by neither."""
+        """Return whether neither body's flight was LOST."""
         return flown(self) and not self.own_failed
 
 
@@ -115,10 +115,10 @@ COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a path of each of ROWS; the LSTM is trained if need be.
+    """Return one case per path and entry of ROWS; the LSTM is trained if necessary.
 
     Raises:
-        InputError: neither RotorPy nor drone-models is installed; as `paper_data`.
+        InputError: neither RotorPy nor drone-models is installed; also as `paper_data`.
     """
     usual = load_limits(DEFAULTS)
     bodies_for(usual.airframe)
@@ -134,7 +134,7 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def measure(network: TrainedNetwork, asked: Asked) -> list[BodyFlight]:
-    """Plan a path, and fly it by each body."""
+    """Plan a path, and fly it with each body."""
     bodies = bodies_for(_airframe(asked.table))
     begun = [BodyFlight(asked.table, asked.planner, asked.name, body.name) for body in bodies]
     try:
@@ -148,7 +148,7 @@ def measure(network: TrainedNetwork, asked: Asked) -> list[BodyFlight]:
 
 
 def bodies_for(airframe: Airframe) -> list[OtherBody]:
-    """Return the bodies that can be had for a vehicle. Raises InputError where there is none."""
+    """Return the bodies that are available for a vehicle. Raises InputError if there is none."""
     found, reasons = [], []
     for body in BODIES:
         try:
@@ -193,7 +193,7 @@ def _planned(network: TrainedNetwork, planner: str, path: Path) -> Trajectory:
 
 
 def _sent(asked: Asked) -> tuple[EncodedFlight, Trajectory]:
-    """Return what is flown of a path, as bytes."""
+    """Return the encoded flight along a path, and its trajectory."""
     if asked.table == HARDWARE:
         way, limits = RAW if asked.planner == TOPPQUAD else CERTIFIED, paper_limits(load_limits(DEFAULTS), TRACKED)
         return encoded_plan(way, asked.planner, None, asked.path, limits)
@@ -203,7 +203,7 @@ def _sent(asked: Asked) -> tuple[EncodedFlight, Trajectory]:
 
 
 def tables(settings: Settings, rows: list[BodyFlight]) -> Iterator[Table]:
-    """Yield, for each planner and body, what the body says, what cfplan says, and how far apart they are."""
+    """Yield the deviations of the body and of cfplan's, and their distance, by planner and body."""
     title = "Flights of the tables by bodies of other simulators"
     yield table("simulators", title, COLUMNS, rows, by=("table", "planner", "body"))
 

@@ -1,7 +1,7 @@
-"""Segment times learned from corridors, as AllocNet does: an LSTM over the boxes, the least times as labels.
+"""Segment times learned from corridors, like AllocNet: an LSTM over the boxes, trained on the least times.
 
-AllocNet learns through its quadratic program, without labels. Here each corridor's label is searched for: the shares of
-its segments for which the motion keeps SPEED and ACCELERATION in the least time (corridors.py beside this file).
+AllocNet learns through its quadratic program, without labels. Here a search finds each corridor's label: the segment
+times for which the motion keeps SPEED and ACCELERATION in the least total time (corridors.py beside this file).
 """
 
 from collections.abc import Sequence
@@ -15,13 +15,13 @@ from cfplan.errors import InfeasibleError, InputError
 from studies.paper.corridors import BOXES, Corridor, least_time, min_jerk
 
 WIDTH, EPOCHS, BATCH, RATE = 64, 100, 50, 3e-3
-FEATURES = 12  # of a box: its middle and the goal from the start, and its shape
-EVENNESS = 0.02  # of the least time, by which shares that are e times each other count as slower: labels are unique
+FEATURES = 12  # per box: its middle and the goal relative to the start, and its shape
+EVENNESS = 0.02  # relative penalty on times that differ by a factor e, which makes labels unique
 _SEARCH = {"maxfev": 50, "xatol": 0.02, "fatol": 0.005}
 
 
 class TimeNetwork(nn.Module):
-    """From the boxes of corridors, (R, B, FEATURES), to the logarithms of the segments' times, (R, B)."""
+    """A network from the boxes of corridors, (R, B, FEATURES), to the logarithms of the segment times, (R, B)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -36,7 +36,7 @@ class TimeNetwork(nn.Module):
 
 
 def box_features(corridor: Corridor) -> NDArray:
-    """Return (B, FEATURES); a box's shape is R diag(half) Rᵀ, as its axes have no signs."""
+    """Return (B, FEATURES); a box's shape is R diag(half) Rᵀ, which does not depend on the signs of its axes."""
     half, middle = (corridor.high - corridor.low) / 2, (corridor.high + corridor.low) / 2
     centres = np.einsum("bij,bj->bi", corridor.axes, middle) - corridor.start
     shapes = np.einsum("bij,bj,bkj->bik", corridor.axes, half, corridor.axes)[:, *np.triu_indices(3)]
@@ -45,15 +45,15 @@ def box_features(corridor: Corridor) -> NDArray:
 
 
 def fastest_times(corridor: Corridor) -> NDArray:
-    """Return the segments' times, (B,) s, of the least sum, by a Nelder-Mead search over their shares.
+    """Return the segment times, (B,) s, with the least sum, by a Nelder-Mead search over their ratios.
 
-    Raises InfeasibleError where no shares that were tried give a motion within the boxes.
+    Raises InfeasibleError if no motion found in the search stays in the boxes.
     """
     from scipy.optimize import minimize
 
     def times_of(x: NDArray) -> NDArray:
-        shares = np.exp([0.0, *x])
-        return shares / shares.sum()
+        ratios = np.exp([0.0, *x])
+        return ratios / ratios.sum()
 
     def total(x: NDArray) -> float:
         try:
@@ -71,7 +71,7 @@ def fastest_times(corridor: Corridor) -> NDArray:
 
 
 def time_label(corridor: Corridor) -> NDArray | None:
-    """Return the logarithms of its fastest times, (B,); None where no motion stays in its boxes."""
+    """Return the logarithms of a corridor's fastest times, (B,), or None if no motion stays in its boxes."""
     try:
         return np.log(fastest_times(corridor))
     except InfeasibleError:
@@ -81,7 +81,7 @@ def time_label(corridor: Corridor) -> NDArray | None:
 def train_times(
     corridors: Sequence[Corridor], labels: Sequence[NDArray | None], *, epochs: int = EPOCHS, seed: int = 0
 ) -> TimeNetwork:
-    """Train a network on the corridors that have a label. Raises InputError where fewer than two have one."""
+    """Train a network on the corridors that have a label. Raises InputError if fewer than two have one."""
     seen = [box_features(each) for each, label in zip(corridors, labels, strict=True) if label is not None]
     wanted = [label for label in labels if label is not None]
     if len(seen) < 2:
@@ -106,6 +106,6 @@ def train_times(
 
 
 def allotted_times(network: TimeNetwork, corridor: Corridor) -> NDArray:
-    """Return the times, (B,) s, that the network allots to the segments."""
+    """Return the network's segment times, (B,) s."""
     with torch.inference_mode():
         return np.exp(network(torch.from_numpy(box_features(corridor))[None])[0].numpy().astype(float))

@@ -1,6 +1,6 @@
-"""The paths and networks of the paper's studies: read where they are there, else labelled and trained first.
+"""The paths and networks of the paper's studies: read a dataset, and load its networks or train them first.
 
-Training that was stopped goes on from its last epoch.
+Interrupted training resumes from its last epoch.
 """
 
 import hashlib
@@ -25,25 +25,25 @@ from studies.runner.result import Column
 from studies.runner.study import Run
 
 DATA, NETWORKS = Path("datasets/paper"), Path("datasets/paper-networks")
-TESTED = 100  # first rows of the dataset, from which nothing is learned
+TESTED = 100  # first rows of the dataset, reserved for testing
 WAYPOINTS = 4
-NODES = 99  # intervals: 100 points
+NODES = 99  # grid intervals: 100 points
 DATA_COMMAND = (
     "cfplan dataset make datasets/paper --count 10100 --seed 1 --limits paper --box 10x10x10 --waypoints 4-4 "
     "--nodes 99 --yaw free"
 )
 QUICK_PATHS, QUICK_TESTED, QUICK_MOST, QUICK_EPOCHS = 40, 20, 4, 2
-QUICK = "A few paths and epochs on data of its own: does it run?"
+QUICK = "Smoke test: a few paths and epochs, on data made for it."
 EPOCHS = f"Epochs of each training.  [default: {SequenceOptions().epochs}]"
 
 
 @dataclass(frozen=True, slots=True)
 class NetworkSettings:
-    """Which paths are planned, and where the networks are that plan them."""
+    """The paths to plan, and the networks that plan them."""
 
-    paths: int = option(100, "Paths for training and for testing each.", least=1)
+    paths: int = option(100, "Number of training paths, and of test paths.", least=1)
     data: Path = option(DATA, "Dataset; its first 100 paths are for testing.")
-    networks: Path = option(NETWORKS, "Folder of the networks; those not there are trained.")
+    networks: Path = option(NETWORKS, "Folder of the networks; missing ones are trained.")
     epochs: int | None = option(None, EPOCHS, least=1)
     quick: bool = option(False, QUICK)
 
@@ -56,11 +56,11 @@ class TrainedNetwork:
     options: SequenceOptions
     network: SequenceNetwork
     learned_from: int  # paths
-    training_seconds: float  # of the processor
+    training_seconds: float  # s of processor time
 
     @property
     def training(self) -> dict[str, Any]:
-        """Return what tables of training show; each row of the network has it."""
+        """Return the figures of the training tables, which each row of the network carries."""
         return {
             "network": self.name,
             "parameters": sum(tensor.numel() for tensor in self.network.parameters()),
@@ -94,7 +94,7 @@ class PaperPath(NamedTuple):
 class PaperData:
     """The paths of a study, and the networks that it asks."""
 
-    paths: dict[str, PaperPath]  # by the names of their cases: first TRAIN, then TEST
+    paths: dict[str, PaperPath]  # by case name: first TRAIN, then TEST
     networks: list[TrainedNetwork]
     identity: dict[str, Any]  # of dataset and networks
 
@@ -106,9 +106,9 @@ class PaperData:
 def paper_data(
     settings: NetworkSettings, run: Run, wanted: Sequence[SequenceOptions], paths: int | None = None
 ) -> PaperData:
-    """Return the paths of a study, by default as many as its settings say, and the networks that it wants.
+    """Return the paths of a study, by default as many as its settings ask for, and the `wanted` networks.
 
-    Raises InputError where there is no such dataset, or too small a one; names the command that makes it.
+    Raises InputError, with the command that makes the dataset, if there is none or it is too small.
     """
     count = settings.paths if paths is None else paths
     data, folder, tested, epochs = settings.data, settings.networks, TESTED, settings.epochs
@@ -136,7 +136,7 @@ def paper_data(
 
 
 def quick_spec() -> DatasetSpec:
-    """Return a dataset of the paper's kind that is made in a second."""
+    """Return the spec of a dataset of the paper's kind that takes a second to make."""
     return DatasetSpec(
         count=QUICK_PATHS, seed=1, limits=PAPER.name, families=(), boxes=(BOXES["10x10x10"],),
         waypoints=(WAYPOINTS, WAYPOINTS), nodes=NODES, yaw=YawMode.FREE,
@@ -146,9 +146,9 @@ def quick_spec() -> DatasetSpec:
 def trained_networks(
     sequences: Sequences, folder: Path, wanted: Sequence[SequenceOptions], run: Run, epochs: int | None = None
 ) -> list[TrainedNetwork]:
-    """Return the networks of a folder, those not there yet after training; `epochs`: in place of the options'.
+    """Return the `wanted` networks of a folder, training those that are missing; `epochs` overrides the options.
 
-    Raises InputError where the folder holds others.
+    Raises InputError if the folder holds networks of another training.
     """
     options = [replace(each, epochs=epochs or each.epochs) for each in wanted]
     total, done = sum(each.epochs for each in options), 0
@@ -171,7 +171,7 @@ def trained_networks(
 
 
 def identities(trained: Iterable[TrainedNetwork]) -> dict[str, Any]:
-    """Return what tells networks of the same names from others: their options, and a digest of their weights."""
+    """Return an identity by network name: options, and a digest of the weights."""
     return {each.name: {**asdict(each.options), "weights": _digest(each.network)} for each in trained}
 
 

@@ -1,9 +1,9 @@
-"""Train the paper's networks, by teacher forcing or on their own answers: a folder each, resumed after a stop.
+"""Train the paper's networks, by teacher forcing or on their own answers, one folder each; training is resumable.
 
-Transformer and MLP learn by teacher forcing, which is what the paper's explanation of their failures rests on; the
-LSTM, of which the paper says that it answers from its own answers, learns so in the second half of its epochs. Noise
-injection as in the paper: half of what is seen in an epoch is perturbed, and keeps the clean path's label. Or, not in
-the paper, it is solved again.
+Transformer and MLP learn by teacher forcing, on which the paper's explanation of their failures rests. The LSTM, which
+according to the paper is fed its own answers, is trained that way in the second half of its epochs. Noise injection
+follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As an option that is not
+in the paper, perturbed paths are solved again.
 """
 
 import json
@@ -29,23 +29,23 @@ from studies.paper.recovery import nodal_time
 from studies.paper.sequences import Inputs, Sequences, select_inputs
 
 WEIGHTS = "weights.safetensors"
-FORCED = (Kind.TRANSFORMER, Kind.MLP)  # that learn from the true answers before
-WARM_UP = 0.05  # of the steps, over which the learning rate rises; then it falls to nothing along a cosine
+FORCED = (Kind.TRANSFORMER, Kind.MLP)  # trained by teacher forcing in all epochs
+WARM_UP = 0.05  # fraction of the steps over which the learning rate rises; it then decays to zero along a cosine
 CLIP = 1.0  # largest norm of the gradient
-YAW = 0.1  # weight of the squared error of cos ψ against that of log h, each in units of its deviation in the data
-NOISE_EPOCHS = 5  # between perturbations
-UNSEEN_SHARE = 0.05  # of the paths, on which each epoch is judged
-FEATURES = "paper 1"  # of what networks see
+YAW = 0.1  # weight of the squared error of cos ψ relative to that of log h, both normalised
+NOISE_EPOCHS = 5  # epochs between new perturbations
+UNSEEN_SHARE = 0.05  # fraction of the paths on which each epoch is validated
+FEATURES = "paper 1"  # version of the networks' inputs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SequenceOptions:
-    """With the sequences these decide a network."""
+    """The options of a training; together with the sequences they determine the network."""
 
     kind: Kind = Kind.LSTM
     inputs: Inputs = Inputs.ALL
     epsilon: float = 0.0  # m, noise injection
-    relabel: Relabel = Relabel.KEEP  # of the paths that it perturbs
+    relabel: Relabel = Relabel.KEEP  # label of perturbed paths
     epochs: int = 14
     batch: int = 50
     rate: float = 3e-3  # the highest learning rate; a third of it for Transformers
@@ -53,7 +53,7 @@ class SequenceOptions:
 
     @property
     def name(self) -> str:
-        """Return the name, which no two networks of a study share."""
+        """Return the network's name, unique within a study."""
         noise = f"-{self.epsilon:g}" if self.epsilon else ""
         noise += "-solved" if self.relabel is Relabel.SOLVE else ""
         return f"{self.kind}{noise}" + ("" if self.inputs is Inputs.ALL else f"-{self.inputs.replace('/', '-')}")
@@ -66,7 +66,7 @@ def train_network(
     *,
     on_epoch: Callable[[Epoch], None] = lambda _: None,
 ) -> SequenceNetwork:
-    """Train the network of `folder`, from its last checkpoint where there is one; return it when it is trained.
+    """Train the network of `folder`, from its last checkpoint if there is one, and return it.
 
     Raises:
         InputError: fewer than three paths, another training in the folder, or a loss that is not a number.
@@ -97,7 +97,7 @@ def train_network(
 
 
 def load_network(folder: Path, sequences: Sequences, options: SequenceOptions) -> tuple[SequenceNetwork, float] | None:
-    """Return the network that was trained there from these sequences, and its processor time, s; None where not yet.
+    """Return the network of `folder` and its training's processor time, s, or None if it is not trained yet.
 
     Raises:
         InputError: the weights of another training, or damaged ones.
@@ -125,7 +125,7 @@ def load_network(folder: Path, sequences: Sequences, options: SequenceOptions) -
 
 
 def answer(network: SequenceNetwork, inputs: NDArray, chosen: Inputs = Inputs.ALL) -> NDArray:
-    """Return h and cos ψ, (R, N, 2), of what is seen of paths, (R, N, 9)."""
+    """Return h and cos ψ, (R, N, 2), for path inputs, (R, N, 9)."""
     with torch.inference_mode():
         found: NDArray = network(torch.from_numpy(np.ascontiguousarray(select_inputs(inputs, chosen)))).numpy()
     return found
@@ -134,7 +134,7 @@ def answer(network: SequenceNetwork, inputs: NDArray, chosen: Inputs = Inputs.AL
 def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
     decided = asdict(options)
     if options.relabel is Relabel.KEEP:
-        del decided["relabel"]  # trainings of older versions, which had no other
+        del decided["relabel"]  # older trainings have no such option
     return {
         "options": json.loads(json.dumps(decided)),
         "data": {
@@ -146,14 +146,14 @@ def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
 
 
 def _split(sequences: Sequences, seed: int) -> tuple[Sequences, Sequences]:
-    """Return those on which epochs are judged, and those to learn from."""
+    """Return the validation set and the training set."""
     order = np.random.default_rng([seed, 0]).permutation(len(sequences.rows))
     count = max(1, round(UNSEEN_SHARE * len(order)))
     return sequences.part(np.sort(order[:count])), sequences.part(np.sort(order[count:]))
 
 
 def _perturbations(known: Sequences, options: SequenceOptions) -> Callable[[int], Sequences]:
-    """Return a function from an epoch to the perturbed paths of it, which it remembers until others take turns."""
+    """Return a function from an epoch to its perturbed paths, with a cache for the current ones."""
 
     @lru_cache(maxsize=1)
     def drawn(turn: int) -> Sequences:
@@ -168,7 +168,7 @@ def _run_epoch(
     network: SequenceNetwork, optimiser: torch.optim.Optimizer, known: Sequences,
     perturb: Callable[[int], Sequences], options: SequenceOptions, epoch: int,
 ) -> tuple[float, float]:  # fmt: skip
-    """Return the mean loss and the last learning rate."""
+    """Train for one epoch; return the mean loss and the last learning rate."""
     random = np.random.default_rng([options.seed, 1, epoch])
     seen, answers = _tensor(known.inputs, options), torch.from_numpy(known.answers)
     if options.epsilon:
@@ -196,7 +196,7 @@ def _run_epoch(
 
 
 def _judge(network: SequenceNetwork, unseen: Sequences, options: SequenceOptions) -> tuple[float, float, float, float]:
-    """Return the loss and the errors of travel time on unseen paths, answered without the truth."""
+    """Return the loss and the errors of travel time on unseen paths, without teacher forcing."""
     network.eval()
     found = answer(network, unseen.inputs, options.inputs)
     loss = _loss(network, torch.from_numpy(found), torch.from_numpy(unseen.answers)).item()
@@ -210,7 +210,7 @@ def _loss(network: SequenceNetwork, found: Tensor, wanted: Tensor) -> Tensor:
 
 
 def _rate(options: SequenceOptions, done: float) -> float:
-    """Return the learning rate when this share of the steps is done."""
+    """Return the learning rate after a fraction `done` of the steps."""
     highest = options.rate / (3.0 if options.kind in (Kind.TRANSFORMER, Kind.ENCODER) else 1.0)
     return highest * min(1.0, (done + 1e-3) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
 
@@ -220,7 +220,7 @@ def _tensor(inputs: NDArray, options: SequenceOptions) -> Tensor:
 
 
 def _save(network: SequenceNetwork, folder: Path, identity: dict[str, Any], log: list[Epoch]) -> None:
-    """Write the weights, whole or not at all; the checkpoint is not needed any more."""
+    """Write the weights atomically, and remove the checkpoint."""
     from safetensors.torch import save_file
 
     card = {"identity": identity, "seconds": sum(epoch.seconds for epoch in log), "last": asdict(log[-1])}

@@ -1,7 +1,7 @@
-"""One path planned by one planner on the paper's terms, and what the paper's tables say of it.
+"""One path planned by one planner under the paper's conditions, and the measures of the paper's tables.
 
-The plan is flown by the geometric controller with the paper's motor lag. Deviation, thrust beyond the motors' range, as
-planned and as asked by the controller, speed above the limit, travel time, and the processor's time to plan.
+The geometric controller flies the plan with the paper's motor lag. The measures are deviation, thrust beyond the range
+of the motors (planned, and requested by the controller), speed above the limit, travel time and processor time to plan.
 """
 
 import time
@@ -33,12 +33,12 @@ from studies.paper.training import answer
 from studies.runner.reductions import among, count, mean
 from studies.runner.result import Column, Table, table
 
-PAPER_LAG = 0.005  # s, time constant of the motors in RotorPy of the paper's day
+PAPER_LAG = 0.005  # s, time constant of the motors in the paper's version of RotorPy
 FLOWN = replace(PAPER.airframe, motor_time_constant=PAPER_LAG)
 TOPPQUAD, EXPERT, SHIPPED = "TOPPQuad", "expert", "the shipped network"
-SAMPLE = 0.002  # s between the moments at which planned thrust and speed are looked at
-_WARM: set[str] = set()  # planners that this process has asked before
-Plan = Callable[[Path], SpeedProfile]  # raises CfplanError where there is none
+SAMPLE = 0.002  # s between samples of planned thrust and speed
+_WARM: set[str] = set()  # planners that this process has run before
+Plan = Callable[[Path], SpeedProfile]  # raises CfplanError if there is no profile
 Ask = Callable[[Path], Trajectory]  # likewise
 Row = TypeVar("Row")
 
@@ -48,44 +48,44 @@ class PaperTrial:
     """One path, planned and flown. NaN where there was nothing to measure."""
 
     planner: str
-    part: str  # whether the network has learned from this path
+    part: str  # TRAIN or TEST: whether the networks have learned from this path
     row: int  # of the dataset
     repaired: bool
-    reason: str = ""  # why there is no flight
+    reason: str = ""  # why there is no flight; empty if there is one
     travel_time: float = np.nan  # s
-    seconds: float = np.nan  # of the processor, to plan
+    seconds: float = np.nan  # s of processor time to plan
     deviation: float = np.nan  # m, LOST where it failed
     violation: float = np.nan  # N, planned
-    asked_violation: float = np.nan  # N, by the controller
+    asked_violation: float = np.nan  # N, requested by the controller
     top_speed: float = np.nan  # m/s, planned
     reference_time: float = np.nan  # s, of TOPPQuad's plan
     training: Mapping[str, Any] | None = None  # of the network that planned
 
     @property
     def slower(self) -> float:
-        """Return by which fraction the plan takes longer than the reference's."""
+        """Return the plan's travel time over the reference's, as a relative excess."""
         return self.travel_time / self.reference_time - 1.0
 
     @property
     def above(self) -> float:
-        """Return by which fraction the planned speed exceeds its limit; NaN without a plan."""
+        """Return the relative excess of the planned speed over its limit; NaN without a plan."""
         return max(self.top_speed / PAPER.limits.speed - 1.0, 0.0) if not self.reason else np.nan
 
 
 def planners(networks: Iterable[TrainedNetwork]) -> dict[str, Plan]:
-    """Return TOPPQuad and the expert, the networks, and the network that ships, by name."""
+    """Return TOPPQuad, the expert, the networks, and the shipped network, by name."""
     found = {TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert)}
     found |= {each.name: network_plan(each) for each in networks}
     return found | {SHIPPED: profile_by(plan_learned)}
 
 
 def paper_task(path: Path, yaw: YawMode = YawMode.FREE) -> PlanningTask:
-    """Return what planners are asked: the paper's vehicle and limits, 100 points, and free yaw as in the paper."""
+    """Return the planning task: the paper's vehicle and limits, 100 points, and by default free yaw as in the paper."""
     return PlanningTask(path, PAPER.airframe, PAPER.limits, NODES, yaw)
 
 
 def profile_of(planner: Planner, task: PlanningTask) -> SpeedProfile:
-    """Return the planner's profile as it answers it. Raises CfplanError, with its reason, where there is none."""
+    """Return the planner's profile, unrepaired. Raises CfplanError, with the planner's reason, if there is none."""
     solution = planner(task)
     if solution.profile is None:
         raise CfplanError(solution.reason or str(solution.status), hint="plan by another planner")
@@ -93,21 +93,21 @@ def profile_of(planner: Planner, task: PlanningTask) -> SpeedProfile:
 
 
 def profile_by(planner: Planner) -> Plan:
-    """Return the planner, asked as the paper asks: see `paper_task`."""
+    """Return a function from a path to the planner's profile for `paper_task`."""
     return lambda path: profile_of(planner, paper_task(path))
 
 
 def shipped_profile(path: Path, yaw: YawMode = YawMode.FREE) -> SpeedProfile:
-    """Return what the planner that ships flies: the network's profile, refined to the optimum and certified.
+    """Return the shipped planner's profile: the network's, refined to the optimum and certified.
 
-    That is how the policy of planning finishes it, whether it passes or not; `repair` would leave alone what passes.
+    The planning policy refines every network profile; `repair` would leave feasible ones unchanged.
     """
     task = paper_task(path, yaw)
     return refine(task, profile_of(plan_learned, task)).trajectory.profile
 
 
 def trajectory_by(plan: Plan) -> Ask:
-    """Return the planner with the flatness map behind it: from a path to a trajectory of the paper's vehicle."""
+    """Return a function from a path to the planner's trajectory for the paper's vehicle."""
     return lambda path: Trajectory(path, plan(path), PAPER.airframe)
 
 
@@ -124,7 +124,7 @@ def network_plan(trained: TrainedNetwork) -> Plan:
 def path_trials(
     plans: Mapping[str, Plan], networks: Mapping[str, TrainedNetwork], asked: PaperPath
 ) -> list[PaperTrial]:
-    """Return what each planner planned, flown as it is and flown after repair; TOPPQuad is one of them."""
+    """Return two trials per planner: flown as planned, and after repair. The planners must include TOPPQuad."""
     trials: list[PaperTrial] = []
     for name, plan in plans.items():
         warm_up(name, partial(plan, asked.path))
@@ -135,7 +135,7 @@ def path_trials(
 
 
 def warm_up(name: str, ask: Callable[[], object]) -> None:
-    """Ask a planner once in this process, so that it is loaded and compiled before it is timed."""
+    """Run a planner once per process, so that it is loaded and compiled before it is timed."""
     if name not in _WARM:
         with suppress(CfplanError):
             ask()
@@ -179,7 +179,7 @@ def failed(flight: Any) -> bool:
 
 
 def flown(flight: Any) -> bool:
-    """Return the contrary."""
+    """Return whether the flight did not fail."""
     return not failed(flight)
 
 
@@ -195,7 +195,7 @@ DEVIATION_FLOWN = Column("deviation_flown", "without failures", "m", ".3f",
 def planner_tables(
     name: str, what: str, printed: Mapping[tuple[str, str], PrintedRow], trials: Sequence[PaperTrial]
 ) -> Iterator[Table]:
-    """Yield the paper's table, of plans as they are, with the paper's numbers beside; the same after repair."""
+    """Yield the paper's table, of plans without repair, beside the paper's numbers, and the same after repair."""
     columns = planner_columns(what, printed)
     bare = [column for column in columns if not column.key.startswith("paper_")]
     terms = f"{PAPER.limits.speed:g} m/s, motor lag {PAPER_LAG:g} s"
@@ -205,20 +205,20 @@ def planner_tables(
 
 
 def ordered(rows: Sequence[Row], by: str = "planner") -> list[Row]:
-    """Return the rows planner by planner, in the order in which these first occur."""
+    """Return the rows grouped by planner, in order of first occurrence."""
     places = {name: place for place, name in enumerate(dict.fromkeys(getattr(row, by) for row in rows))}
     return sorted(rows, key=lambda row: places[getattr(row, by)])
 
 
 def training_table(rows: Sequence[Any], by: str = "planner") -> Table:
-    """Return the size and the training of each network, of rows that say by which network they are."""
+    """Return a table of the size and training of each network that the rows name."""
     columns = (Column("network", "network", value=lambda rows: rows[0].training["network"]), PARAMETERS)
     of_networks = [row for row in rows if row.training]
     return table("training", "Networks and their training", (*columns, *TRAINING_COLUMNS), of_networks, by=(by,))
 
 
 def planner_columns(what: str, printed: Mapping[tuple[str, str], PrintedRow]) -> tuple[Column, ...]:
-    """Return the columns of the paper's tables of planners, each with the paper's beside it."""
+    """Return the columns of the paper's tables of planners, each beside the paper's numbers."""
     paper = partial(paper_column, printed, by=("planner", "part"))
     return (
         Column("planner", what),

@@ -1,7 +1,7 @@
 """Make the paper's figure of yaw consistency: TOPPQuad on pairs of paths whose first waypoint is 0.1 m apart.
 
-Without the penalty on angular acceleration many yaws are as good as each other where the speed limit binds, and a
-small change of the path may choose another. The expert plans the same pairs.
+Without the penalty on angular acceleration, many yaw profiles are equally good where the speed limit binds, and a small
+change of the path may select another one. The expert plans the same pairs.
 """
 
 from collections.abc import Iterator
@@ -29,19 +29,19 @@ from studies.runner.reductions import among, count, largest, mean, median, quant
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-MOVED = (0.1, 0.0, 0.0)  # m, the first waypoint
+MOVED = (0.1, 0.0, 0.0)  # m, displacement of the first waypoint
 PLAIN, PENALISED, EXPERT = "TOPPQuad, λ = 0", f"TOPPQuad, λ = {PENALTY:g}", "expert"
 WAYS: dict[str, Planner] = {
     PLAIN: partial(plan_toppquad, penalty=0.0),
     PENALISED: plan_toppquad,
     EXPERT: plan_expert,
 }
-EDGES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, np.inf)  # rad, of the histogram of yaw
+EDGES = (0.0, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, np.inf)  # rad, bin edges of the yaw histogram
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Which pairs are planned."""
+    """The pairs to plan."""
 
     pairs: int = option(100, "Pairs of random paths.", least=1)
     seed: int = option(50_000, "Seed of the first pair.", least=0)
@@ -49,20 +49,20 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Pair:
-    """One path and the same with its first waypoint moved. NaN where there was nothing to measure."""
+    """A path, and the same path with its first waypoint moved. NaN where there was nothing to measure."""
 
     planner: str
     seed: int
-    reason: str = ""  # why there is no pair
-    travel_time: float = np.nan  # s, of the path as it is
+    reason: str = ""  # why the pair was not planned; empty if it was
+    travel_time: float = np.nan  # s, of the unmoved path
     h: float = np.nan  # largest difference at a node
     h_relative: float = np.nan  # the same, relative
-    time: float = np.nan  # s, difference of travel times, absolute
+    time: float = np.nan  # s, absolute difference of travel times
     yaw: float = np.nan  # rad, largest difference at a node
 
     @property
     def solved(self) -> bool:
-        """Return whether both of its paths were planned."""
+        """Return whether both paths were planned."""
         return not self.reason
 
 
@@ -91,13 +91,13 @@ HISTOGRAM = (Column("planner", "Δyaw, rad"), *(_bin_column(*edges) for edges in
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return a case a pair."""
+    """Return one case per pair."""
     seeds = range(settings.seed, settings.seed + settings.pairs)
     return Work({str(seed): seed for seed in seeds}, measure, Pair)
 
 
 def measure(seed: int) -> list[Pair]:
-    """Plan the pair of paths of that seed in each of WAYS."""
+    """Plan the pair of paths of a seed in each of WAYS."""
     half = np.array(BOXES["10x10x10"]) / 2
     waypoints = random_waypoints(seed, np.array([-half, half]), (WAYPOINTS, WAYPOINTS))
     moved = waypoints + np.array([MOVED] + [(0.0, 0.0, 0.0)] * (WAYPOINTS - 1))
@@ -125,7 +125,7 @@ def _pair(name: str, seed: int, planner: Planner, path: Path, moved: Path) -> Pa
 
 
 def tables(settings: Settings, rows: list[Pair]) -> Iterator[Table]:
-    """Yield how far the two of a pair differ, in the median and at worst, and how many differ in yaw by how much."""
+    """Yield the median and largest differences within pairs, and a histogram of the differences of yaw."""
     title = f"Pairs of paths, first waypoint moved by {MOVED[0]:g} m, {PAPER.limits.speed:g} m/s, yaw from [0, π/2]"
     yield table("differences", title, COLUMNS, rows, by=("planner",))
     yield table("yaw-histogram", "Pairs by their largest difference of yaw", HISTOGRAM, rows, by=("planner",))

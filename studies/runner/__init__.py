@@ -1,5 +1,5 @@
-"""The runner of studies: what a study is, how its cases are measured, and where its results go.
+"""The runner of studies: measures their cases, writes their results, and shows these in the docs.
 
-`study` says what a study is, `options` makes its command, `cases` measures it case by case, `result` and `reductions`
-are its tables, `provenance`, `sources` and `machine` say where a result comes from, `pages` shows results in docs/.
+`study` defines a study, `options` its command line, `cases` measures it case by case, `result` and `reductions` build
+its tables, `provenance`, `sources` and `machine` describe the origin of a result, `pages` shows results in docs/.
 """

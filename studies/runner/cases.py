@@ -1,8 +1,8 @@
-"""Measure a study's cases: by several processes, on a cluster, and onwards from where a run was stopped.
+"""Measure a study's cases: in several processes or on a cluster, resuming a run that was stopped.
 
-What is measured is kept case by case in a file beside the result: its first line says of which study, settings and
-sources it is, each further line holds one case. A run of the same study goes on from it. A file of other sources or
-settings is stale: it is set aside under a name that says so, and nothing of it is used.
+Finished cases are kept in a file beside the result: its first line holds study, settings and digest of the sources,
+each further line one case. A run of the same study resumes from it. A file of other sources or settings is stale: it is
+renamed, and its cases are not used.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from studies.runner.provenance import provenance
 from studies.runner.result import StudyResult
 from studies.runner.study import Progress, Run, Study, Work
 
-UNFINISHED, STALE = ".unfinished", ".stale-"  # behind the name of the result's file
+UNFINISHED, STALE = ".unfinished", ".stale-"  # suffixes to the name of the result's file
 SHORT = 12  # characters of a commit, in names
 
 
@@ -33,25 +33,25 @@ class Effort:
     """How a study's cases are measured."""
 
     workers: int = 1  # processes on this machine
-    scheduler: str | None = None  # address of a Dask cluster that works instead
-    minutes: float = float("inf")  # after which no case is begun
-    output: Path | None = None  # file of the result, beside which finished cases are kept; None: nowhere
-    say: Callable[[str], None] = lambda _: None  # is told which file was set aside
-    progress: Callable[[str], Progress] = lambda name: lambda done, total: None  # of what is named
+    scheduler: str | None = None  # address of a Dask cluster to use instead
+    minutes: float = float("inf")  # after which no further case is begun
+    output: Path | None = None  # file of the result; finished cases are kept beside it; None: nowhere
+    say: Callable[[str], None] = lambda _: None  # called with a message about a stale file
+    progress: Callable[[str], Progress] = lambda name: lambda done, total: None  # makes the callback for a name
 
 
 def run_study(name: str, module: str, study: Study, settings: Any, effort: Effort | None = None) -> StudyResult:
-    """Measure every case and return the result; an interrupt ends it early with what is measured by then.
+    """Measure every case and return the result; an interrupt ends the run early with the cases measured so far.
 
     Raises:
-        InputError: several processes for a study that goes by the clock, or a file beside the result that cannot be
-            written; what the study raises.
+        InputError: several processes for a study that measures wall-clock time, or the file beside the result cannot
+            be written; also as the study.
         SchedulerError: as `pool`.
     """
     effort = effort or Effort()
     if study.one_at_a_time and (effort.workers > 1 or effort.scheduler):
         raise InputError("goes by the computer's clock", where=name, hint="leave --workers and --scheduler out")
-    made = provenance(module)  # of the beginning
+    made = provenance(module)  # before measuring, as sources may change meanwhile
     with tempfile.TemporaryDirectory() as scratch:
         work = study.work(settings, Run(Path(scratch), effort.workers, effort.scheduler, effort.progress("preparing")))
         rows, interrupted, seconds = _measured(name, module, settings, work, effort)
@@ -60,7 +60,7 @@ def run_study(name: str, module: str, study: Study, settings: Any, effort: Effor
 
 
 def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort) -> tuple[list[Any], bool, float]:
-    """Return the rows in the order of the cases, whether some were not measured, and the processor's seconds."""
+    """Return the rows in the order of the cases, whether cases are missing, and the processor time, s."""
     file = None if effort.output is None else unfinished_file(effort.output)
     header = {
         "study": name, "settings": plain(asdict(settings)), "files": _digests(settings),
@@ -84,7 +84,7 @@ def _measured(name: str, module: str, settings: Any, work: Work, effort: Effort)
 
 
 def _digests(settings: Any) -> dict[str, str]:
-    """Return the digests of the files that settings name."""
+    """Return the digest of each file that the settings name."""
     values = (getattr(settings, each.name) for each in fields(settings))
     named = [path for value in values for path in (value if isinstance(value, tuple) else (value,))]
     files = (path for path in named if isinstance(path, Path) and path.is_file())
@@ -94,18 +94,18 @@ def _digests(settings: Any) -> dict[str, str]:
 class _Done(NamedTuple):
     name: str
     rows: list[dict[str, Any]]
-    seconds: float  # of the processor
+    seconds: float  # s of processor time
 
 
 def write_result(result: StudyResult, file: Path) -> None:
-    """Write a result; its finished cases are kept only where it was interrupted."""
+    """Write a result; keep the file of finished cases only if the run was interrupted."""
     result.write(file)
     if not result.interrupted:
         unfinished_file(file).unlink(missing_ok=True)
 
 
 def unfinished_file(result: Path) -> Path:
-    """Return the file of the finished cases of a result that is not complete yet."""
+    """Return the file of the finished cases of an incomplete result."""
     return result.with_name(result.name + UNFINISHED)
 
 
@@ -118,14 +118,14 @@ def _timed(measure: Callable[[Any], Any], case: tuple[str, Any]) -> _Done:
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it; unlike in results, what is not finite stays what it is."""
+    """Return a value as plain JSON types; unlike in results, numbers that are not finite are kept."""
     return json.loads(json.dumps(value, default=_simpler))
 
 
 def _simpler(value: Any) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return asdict(value)
-    if hasattr(value, "tolist"):  # of NumPy
+    if hasattr(value, "tolist"):  # NumPy arrays and scalars
         return value.tolist()
     if isinstance(value, Path):
         return str(value)
@@ -137,7 +137,7 @@ def _resume(file: Path, header: Mapping[str, Any], say: Callable[[str], None]) -
     try:
         lines = _lines(file) if file.is_file() else []
         if lines and {**lines[0], "commit": ""} == {**header, "commit": ""}:
-            write_whole(file, _text(lines))  # without the last, where a kill has cut it off
+            write_whole(file, _text(lines))  # drops a last line that a kill has cut off
             return {line["name"]: _Done(**line) for line in lines[1:]}
         if lines:
             aside = file.with_name(file.name.removesuffix(UNFINISHED) + STALE + str(lines[0].get("commit"))[:SHORT])

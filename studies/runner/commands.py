@@ -1,4 +1,4 @@
-"""The commands of `python -m studies`: one for each study, and those that make pages and figures of their results."""
+"""The commands of `python -m studies`: one per study, and those that make pages and figures from results."""
 
 import importlib
 import signal
@@ -20,10 +20,10 @@ from studies.runner.study import Progress, Study
 
 
 class _Studies(click.Group):
-    """Imports a study when it is asked for."""
+    """A group of commands that imports a study only when it is run."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """Return the names of all studies, then of what makes pages of them."""
+        """Return the names of all studies, then of the commands that show their results."""
         return [*sorted(STUDIES), *sorted({*COMMANDS, *self.commands})]
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -33,7 +33,7 @@ class _Studies(click.Group):
             formatter.write_dl([(name, each.get_short_help_str(300)) for name, each in found if each is not None])
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
-        """Return the command of that name. Raises InputError where there is none."""
+        """Return the command of this name. Raises InputError if there is none."""
         if name in self.commands:
             return self.commands[name]
         if name in COMMANDS:
@@ -54,7 +54,7 @@ def study_command(name: str, module: str) -> click.Command:
     study: Study = found.STUDY
 
     def run(output: Path | None, workers: int, scheduler: str | None, minutes: float | None, **given: Any) -> None:
-        if output is not None and not output.parent.is_dir():  # before an hour is spent measuring
+        if output is not None and not output.parent.is_dir():  # before hours of measuring
             raise InputError("no such folder", where=str(output.parent), hint="make it first")
         settings = settings_of(study.settings, given)
         with progress_bars() as bar:
@@ -74,11 +74,11 @@ def study_command(name: str, module: str) -> click.Command:
 WORKERS = click.option(
     "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
 )
-SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster that works instead: tcp://host:port.")
+SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster to use instead: tcp://host:port.")
 _EFFORT = (
     WORKERS,
     SCHEDULER,
-    click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Time after which no case is begun."),
+    click.option("--minutes", type=click.FloatRange(0, min_open=True), help="Minutes after which no case is begun."),
     click.option("-o", "--output", type=click.Path(path_type=Path), help="JSON file for the result."),
 )
 
@@ -90,9 +90,9 @@ def studies() -> None:
 
 @studies.command()
 @click.argument("folder", metavar="[REPOSITORY]", type=click.Path(path_type=Path), default=Path())
-@click.option("--fresh", is_flag=True, help="Fail where README shows a figure of other sources, as before a release.")
+@click.option("--fresh", is_flag=True, help="Fail if README shows a figure of other sources; for releases.")
 def pages(folder: Path, fresh: bool) -> None:
-    """Write the figures of README and docs/ anew from results/, and list the results that are out of date."""
+    """Update the figures in README and docs/ from results/, and list the results that are out of date."""
     from studies.runner.pages import stale_results, write_figures
 
     for page in write_figures(folder):
@@ -113,7 +113,7 @@ def print_result(result: StudyResult) -> None:
 
 
 def print_table(table: Table) -> None:
-    """Print a table, as wide as it is where standard output is no terminal."""
+    """Print a table; at full width if standard output is not a terminal."""
     from rich import box
     from rich.console import Console
     from rich.table import Table as RichTable
@@ -132,7 +132,7 @@ def print_table(table: Table) -> None:
 
 @contextmanager
 def progress_bars() -> Iterator[Callable[[str], Progress]]:
-    """Yield a function from a name to what is told of its progress: a bar on stderr, with the time left."""
+    """Yield a function from a name to its progress callback, which shows a bar with the time left on stderr."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -152,7 +152,7 @@ def note(text: str) -> None:
 
 
 def main() -> None:
-    """Run the command line; a user's mistake ends in one line, never in a traceback."""
+    """Run the command line; a user's mistake is reported in one line, without a traceback."""
     try:
         sys.exit(studies.main(prog_name="python -m studies", standalone_mode=False) or 0)
     except click.exceptions.Exit as ending:

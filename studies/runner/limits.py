@@ -9,9 +9,9 @@ from cfplan.safety.limits_file import load_limits
 
 
 def limits_for(path_file: Path) -> Limits:
-    """Return the limits of the safety.yaml nearest to the working folder, or else to the path file.
+    """Return the limits of the nearest safety.yaml in or above the working folder, or else above the path file.
 
-    Raises InputError where there is none, or what reading it raises.
+    Raises InputError if there is none or it is invalid.
     """
     found = nearest("safety.yaml", Path.cwd(), path_file.resolve().parent)
     if found is None:

@@ -1,4 +1,4 @@
-"""Describe the machine that measures, and keep it to one thread. Imports nothing heavy: call one_thread first."""
+"""Describe the measuring machine, and limit libraries to one thread. Imports nothing heavy: call one_thread first."""
 
 import math
 import os
@@ -17,10 +17,10 @@ PACKAGES = ("casadi", "copp-py", "numba", "numpy", "scikit-learn", "scipy", "tor
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Enough to judge a time by."""
+    """The machine and libraries that a measured time depends on."""
 
     processor: str
-    cores: int  # that this process may use
+    cores: int  # usable by this process
     system: str
     python: str
     cfplan: str
@@ -32,7 +32,7 @@ def one_thread() -> None:
     """Ask numerical libraries for one thread each.
 
     Raises:
-        InputError: one of them is loaded already with another number.
+        InputError: numpy is already loaded with another number of threads.
     """
     late = "numpy" in sys.modules and any(os.environ.get(name) != "1" for name in THREADS[:2])
     if late:
@@ -42,7 +42,7 @@ def one_thread() -> None:
 
 
 def this_machine() -> Machine:
-    """Return the one that runs this."""
+    """Return a description of this machine."""
     packages = {}
     for name in PACKAGES:
         try:
@@ -71,9 +71,9 @@ def _processor() -> str:
 
 
 def process_memory(name: str) -> float:
-    """Return VmRSS, what this process uses now, or VmHWM, its peak, in MB as Linux counts them; NaN elsewhere.
+    """Return VmRSS, the present memory of this process, or VmHWM, its peak, in MB, on Linux; NaN elsewhere.
 
-    Unlike getrusage, VmHWM does not begin with the peak of the process that started this one.
+    Unlike that of getrusage, the peak does not include that of the process that started this one.
     """
     try:
         status = Path("/proc/self/status").read_text()

@@ -1,4 +1,4 @@
-"""The command of a study: options and help follow from the dataclass of its settings."""
+"""Command-line options of a study, derived from the dataclass of its settings."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import MISSING, Field, field, fields
@@ -9,24 +9,24 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 import click
 
-_HELP, _CHOICES, _LEAST, _ARGUMENT = "help", "choices", "least", "argument"  # in a field's metadata
+_HELP, _CHOICES, _LEAST, _ARGUMENT = "help", "choices", "least", "argument"  # keys in a field's metadata
 
 
 def option(default: Any, text: str, *, least: float | None = None, choices: tuple[str, ...] = ()) -> Any:
-    """Return a field of settings that is an option: its default, its help, and what it may be.
+    """Return a dataclass field that becomes an option, with its default, help, least value and choices.
 
-    A tuple may be given several times; `choices` are those of each value.
+    An option with a tuple as default is repeatable; `least` and `choices` apply to each value.
     """
     return field(default=default, metadata={_HELP: text, _LEAST: least, _CHOICES: choices})
 
 
 def argument() -> Any:
-    """Return a field of settings that is an argument; a tuple takes one or more."""
+    """Return a dataclass field that becomes an argument; a tuple takes one or more values."""
     return field(metadata={_ARGUMENT: True})
 
 
 def parameters(settings: type) -> Iterator[Callable[[Callable[..., Any]], Callable[..., Any]]]:
-    """Yield what adds the options and arguments of settings to a command, in their order."""
+    """Yield the decorators that add the options and arguments of `settings` to a command, in order."""
     hints = get_type_hints(settings)
     for each in fields(settings):
         yield _parameter(each, hints[each.name])
@@ -75,7 +75,7 @@ def _type(kind: type, each: Field) -> click.ParamType:
 
 
 def settings_of(settings: type, given: dict[str, Any]) -> Any:
-    """Return the settings of what a command was given; options left out keep their defaults."""
+    """Return the settings for a command's parameters; options that were left out keep their defaults."""
     hints = get_type_hints(settings)
     chosen = {}
     for each in fields(settings):

@@ -1,14 +1,14 @@
 """Show results in README and docs/, between markers that name them.
 
 <!-- table: results/bench.json#time-4.5x8x2-hardware -->     its title and its cells
-<!-- columns: results/bench.json#time-4.5x8x2-hardware -->   what its columns mean
+<!-- columns: results/bench.json#time-4.5x8x2-hardware -->   the meanings of its columns
 <!-- measured: results/bench.json -->                        command, date, commit and machine
-<!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is what its first column shows,
-                                                             or its first columns, joined by ` / `, until it is one row
+<!-- figure: results/bench.json#TABLE/ROW/COLUMN -->        one cell, within a line; ROW is the text of its first cell,
+                                                             or of as many cells as identify it, joined by ` / `
 <!-- end -->                                                 ends any of them
 
-The site's hook renders all of them. In the files, only figures are filled in: sentences need them on the forge, too.
-Where a result was measured with other sources than the present ones, its figures bear a mark, †.
+The site's hook renders all of them. In the files only figures are filled in, so that sentences can also be read on the
+forge. Figures of a result that was measured with sources other than the present ones are marked with †.
 """
 
 import re
@@ -20,7 +20,7 @@ from cfplan.errors import InputError
 from studies.runner.provenance import Provenance
 from studies.runner.result import Table, read_result
 
-OUT_OF_DATE = "†"  # behind a figure that was measured with other sources
+OUT_OF_DATE = "†"  # follows a figure that was measured with other sources
 _BLOCK = re.compile(
     r"(?P<begin><!-- (?P<kind>table|columns|measured): (?P<file>[^#\s]+)(?:#(?P<name>\S+))? -->\n).*?"
     r"(?P<end><!-- end -->)",
@@ -33,7 +33,7 @@ _FIGURE = re.compile(
 
 
 def with_results(page: str, folder: Path) -> str:
-    """Return a page's text with everything that is marked; files are found from `folder`. Raises InputError."""
+    """Return a page's text with all blocks and figures rendered; files are relative to `folder`. Raises InputError."""
 
     def block(match: re.Match[str]) -> str:
         result = read_result(folder / match["file"])
@@ -48,7 +48,7 @@ def with_results(page: str, folder: Path) -> str:
 
 
 def with_figures(page: str, folder: Path) -> str:
-    """Return a page's text with the figures in its sentences. Raises InputError."""
+    """Return a page's text with the figures in its sentences updated. Raises InputError."""
 
     def figure(match: re.Match[str]) -> str:
         result = read_result(folder / match["file"])
@@ -59,7 +59,7 @@ def with_figures(page: str, folder: Path) -> str:
 
 
 def write_figures(folder: Path) -> list[Path]:
-    """Fill the figures into README and every page under docs/ of `folder`; return the files that changed.
+    """Update the figures in README and every page under docs/ of `folder`; return the changed files.
 
     Raises InputError.
     """
@@ -92,7 +92,7 @@ def _fresh(made: Provenance | None) -> bool:
 
 
 def _cell(table: Table, name: str, key: str) -> str:
-    """Return one cell as it is shown. Raises InputError where there is none, or where the name is of several rows."""
+    """Return one cell as shown. Raises InputError if there is none, or if several rows have the name."""
     shown = [column for column in table.columns if column.title]
     rows = [row for row in table.rows if name in accumulate((column.text(row) for column in shown), "{} / {}".format)]
     columns = [column for column in table.columns if column.key == key]

@@ -1,4 +1,4 @@
-"""Where a measurement comes from: the command, the date, the commit and the sources of cfplan, and the machine."""
+"""The provenance of a measurement: command, date, commit and sources of cfplan, and the machine."""
 
 import shlex
 import sys
@@ -15,30 +15,30 @@ from studies.runner.sources import DATA, PACKAGES, sources_digest
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Enough to make the measurement again."""
+    """Everything needed to repeat a measurement."""
 
     command: str
-    date: str  # of its beginning, ISO 8601
-    commit: str  # of cfplan; "unknown" where it does not run from its repository
-    modified: bool  # cfplan, its models or its limits were not as in that commit
+    date: str  # when it began, ISO 8601
+    commit: str  # of cfplan; "unknown" outside of its repository
+    modified: bool  # cfplan, its models or its limits differed from that commit
     machine: Machine
     module: str = ""  # of the study; "" in results from before sources were noted
     sources: str = ""  # digest of all that the figures depend on
 
     @property
     def fresh(self) -> bool:
-        """Return whether the figures are those of the present sources."""
+        """Return whether the sources are the present ones."""
         return bool(self.module) and self.sources == sources_digest(self.module)
 
     @staticmethod
     def from_json(document: Mapping[str, Any]) -> "Provenance":
-        """Return the provenance that a result's JSON names."""
+        """Return the provenance from a result's JSON."""
         return Provenance(**{**document, "machine": Machine(**document["machine"])})
 
 
 @cache
 def provenance(module: str) -> Provenance:
-    """Return that of this process and a study, as it was at the first call."""
+    """Return the provenance of a study in this process, as of the first call."""
     return Provenance(
         command=shlex.join(["python", "-m", "studies", *sys.argv[1:]]),
         date=datetime.now(UTC).isoformat(timespec="seconds"),

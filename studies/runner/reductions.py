@@ -1,7 +1,7 @@
-"""Reductions: what a column of a table says of the rows of a group. Each returns a function from rows to a value.
+"""Reductions of a group of rows to one value of a table. Each function here returns a function of the rows.
 
-A value is the name of a row's field, or a function of the row; where it is not finite there was nothing to measure,
-and the row does not count. Of no rows there is no mean: NaN.
+A value is the name of a row's field, or a function of the row. Rows whose value is not finite are ignored; means
+and extremes of no rows are NaN.
 """
 
 import math
@@ -16,7 +16,7 @@ Reduction = Callable[[Sequence[Any]], Any]
 
 
 def count(where: Value | None = None) -> Reduction:
-    """Count the rows, or those of which the value holds."""
+    """Return the number of rows, or of those whose value is true."""
     holds = (lambda row: True) if where is None else _getter(where)
     return lambda rows: sum(bool(holds(row)) for row in rows)
 
@@ -57,18 +57,18 @@ def farthest(value: Value) -> Reduction:
 
 
 def total(value: Value) -> Reduction:
-    """Return the sum; 0 of nothing."""
+    """Return the sum; 0 without rows."""
     return lambda rows: float(np.nansum(finite(rows, value)))
 
 
 def among(where: Value, reduction: Reduction) -> Reduction:
-    """Return the reduction of those rows of which `where` holds."""
+    """Return the reduction of the rows for which `where` is true."""
     holds = _getter(where)
     return lambda rows: reduction([row for row in rows if holds(row)])
 
 
 def finite(rows: Iterable[Any], value: Value) -> np.ndarray:
-    """Return the values that are finite as an array that is never empty: of none it holds NaN."""
+    """Return the finite values as an array, or [NaN] if there are none."""
     get = _getter(value)
     found = [number for row in rows if (number := get(row)) is not None and math.isfinite(number)]
     return np.array(found or [np.nan], dtype=float)

@@ -1,4 +1,4 @@
-"""The result of a study: what was run, on what and when, with its tables as data; written to JSON and read from it."""
+"""The result of a study: settings, provenance, and tables as data, with reading and writing of JSON."""
 
 import json
 import math
@@ -13,27 +13,27 @@ from cfplan.numbers import shown
 from studies.runner.provenance import Provenance
 from studies.runner.reductions import Reduction, Value, quantile
 
-NOTHING = "–"  # stands where there was nothing to measure
-SCALE = {"ms": 1e3, "µs": 1e6, "cm": 1e2, "%": 1e2}  # from a value in SI to one in the unit
+NOTHING = "–"  # shown for a value that was not measured
+SCALE = {"ms": 1e3, "µs": 1e6, "cm": 1e2, "%": 1e2}  # factor from SI to the unit
 LEVELS = {"median": 0.5, "p90": 0.9, "p99": 0.99}
-ITEMS = "items"  # folder beside the results, of what was measured case by case
+ITEMS = "items"  # folder beside the results for the rows of the cases
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One column of a table: what it says of the rows of a group, and how that is shown."""
+    """One column of a table: how the rows of a group are reduced to a value, and how that is shown."""
 
     key: str
-    title: str = ""  # empty: in the JSON only
-    unit: str = ""  # in which a value, which is in SI, is shown
+    title: str = ""  # empty: the column is only in the JSON
+    unit: str = ""  # in which the value, stored in SI units, is shown
     format: str = ""  # Python's format specification
-    of: str = ""  # key of the total of which this is a count
-    goal: str = ""  # what it should not exceed
-    meaning: str = ""  # where the title alone does not say it
+    of: str = ""  # key of the column with the total of this count
+    goal: str = ""  # target, as text
+    meaning: str = ""  # explanation, where the title alone is not enough
     value: Reduction | None = None  # of the group's rows; None: the field `key` of its first row
 
     def text(self, row: Mapping[str, Any]) -> str:
-        """Return the column's cell of this row."""
+        """Return the text of this column's cell in a row."""
         value = row[self.key]
         if value is None or value == "" or (isinstance(value, float) and not math.isfinite(value)):
             return NOTHING
@@ -48,16 +48,16 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows by the keys of the columns. Values are in SI; fractions are at most 1."""
+    """A table: each row maps the columns' keys to values in SI units, with percentages as fractions."""
 
-    name: str  # by which a page of docs asks for it
+    name: str  # by which a page of the docs refers to it
     title: str
     columns: tuple[Column, ...]
     rows: tuple[Mapping[str, Any], ...]
-    across: bool = False  # shown with a column for each row, under the first column's value
+    across: bool = False  # transposed: one column per row, headed by its first cell
 
     def cells(self) -> tuple[list[str], list[list[str]]]:
-        """Return the titles and the cells as they are shown."""
+        """Return the titles and the cells as shown."""
         shown = [column for column in self.columns if column.title]
         if not self.across:
             return [column.title for column in shown], [[column.text(row) for column in shown] for row in self.rows]
@@ -67,7 +67,7 @@ class Table:
         return titles, cells if self.rows else []
 
     def to_json(self) -> dict[str, Any]:
-        """Return the table as JSON has it: each row is a list in the order of the columns."""
+        """Return the table for JSON: each row is a list in the order of the columns."""
         return {
             "name": self.name,
             "title": self.title,
@@ -78,7 +78,7 @@ class Table:
 
     @staticmethod
     def from_json(document: Mapping[str, Any]) -> "Table":
-        """Return the table that `to_json` made this of."""
+        """Return the table from the output of `to_json`."""
         columns = tuple(Column(**column) for column in document["columns"])
         keys = [column.key for column in columns]
         rows = tuple(dict(zip(keys, row, strict=True)) for row in document["rows"])
@@ -101,9 +101,9 @@ def table(
     last: str = "",
     across: bool = False,
 ) -> Table:
-    """Return the table of these rows, dataclasses or mappings: a line for each group of rows.
+    """Return a table of rows, dataclasses or mappings, with one line per group of rows.
 
-    Rows of a group agree in the fields `by`; None: each row is a group. `last` names a further line, of all rows.
+    Rows of a group agree in the fields `by`; None: each row is a group. `last` names an additional line for all rows.
     """
     groups: dict[Any, list[Any]] = {}
     for number, row in enumerate(rows):
@@ -126,7 +126,7 @@ def quantile_columns(
     key: str, title: str, unit: str, spec: str, value: Value | None = None, *,
     shown: Sequence[str] = ("median", "p99"), meaning: str = "",
 ) -> tuple[Column, ...]:  # fmt: skip
-    """Return the columns of median, p90 and p99 of a value, by default the field `key`; those not shown are hidden."""
+    """Return columns of median, p90 and p99 of a value, by default the field `key`; those not in `shown` are hidden."""
     titles = {level: f"{title}, {level}" if level in shown else "" for level in LEVELS}
     first = next(iter(shown), "")
     return tuple(
@@ -141,15 +141,15 @@ class StudyResult:
     """One run of a study."""
 
     study: str
-    settings: Mapping[str, Any]  # what the run was asked for
+    settings: Mapping[str, Any]  # options and arguments of the run
     tables: tuple[Table, ...]
-    rows: Sequence[Any] = ()  # what was measured case by case; not in the JSON
-    interrupted: bool = False  # by the user or for lack of time: holds what was measured until then
-    seconds: float = 0.0  # of the processor, to measure the cases
+    rows: Sequence[Any] = ()  # measured case by case; not in the JSON
+    interrupted: bool = False  # by the user or --minutes: only the cases measured before are included
+    seconds: float = 0.0  # s of processor time to measure the cases
     provenance: Provenance | None = None
 
     def table(self, name: str) -> Table:
-        """Return the table of that name. Raises InputError."""
+        """Return the table of this name. Raises InputError if there is none."""
         for each in self.tables:
             if each.name == name:
                 return each
@@ -157,7 +157,7 @@ class StudyResult:
         raise InputError(f"the study {self.study} has no table {name!r}", hint=f"known: {known}")
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON has it; what is not finite is null."""
+        """Return the result for JSON; numbers that are not finite become null."""
         return {
             "study": self.study,
             "provenance": json_value(self.provenance),
@@ -168,7 +168,7 @@ class StudyResult:
         }
 
     def write(self, file: Path) -> None:
-        """Write the JSON, each row on one line; and the rows of the cases, as Parquet, in a folder beside it."""
+        """Write the JSON, one line per row, and the rows of the cases as Parquet in a folder beside it."""
         file.write_text(_text(self.to_json()) + "\n", encoding="utf-8")
         if self.rows:
             _write_rows(self.rows, file.parent / ITEMS / f"{file.stem}.parquet")
@@ -184,7 +184,7 @@ def _write_rows(rows: Iterable[Any], file: Path) -> None:
 
 
 def read_result(file: Path) -> StudyResult:
-    """Read what `StudyResult.write` wrote, but for the rows of the cases. Raises InputError."""
+    """Read a result written by `StudyResult.write`, without the rows of the cases. Raises InputError."""
     try:
         document = json.loads(file.read_text(encoding="utf-8"))
         return StudyResult(
@@ -206,7 +206,7 @@ def read_result(file: Path) -> StudyResult:
 
 
 def _text(value: Any, indent: str = "") -> str:
-    """Write JSON so that a table's row, a column, or anything else without parts is one line."""
+    """Return JSON in which a table's row, a column, and any other value without nested containers is one line."""
     deeper = indent + " "
     match value:
         case dict() if any(isinstance(item, dict | list) for item in value.values()):

@@ -1,7 +1,7 @@
 """The sources that a study's figures depend on, and their digest: a result of other sources is out of date.
 
-Those are the study's module and all modules of cfplan and studies that these import, anywhere in them, with the models
-and the limits that are shipped. Comments, docstrings and layout do not count.
+The sources are the study's module, all modules of cfplan and studies that it imports, directly or not, and the shipped
+models and limits. Comments, docstrings and layout do not count.
 """
 
 import ast
@@ -18,7 +18,7 @@ PACKAGES = ("cfplan", "studies")
 
 @cache
 def sources_digest(module: str) -> str:
-    """Return the digest of all that the figures of a study depend on; `module` is its name, as studies.flights."""
+    """Return the digest of everything that a study's figures depend on; `module` is a name such as studies.flights."""
     digest = hashlib.sha256()
     for file in sorted(_closure(module)):
         digest.update(f"{file.relative_to(REPOSITORY)}\n{_code_digest(file)}\n".encode())
@@ -54,7 +54,7 @@ def _imported(file: Path) -> list[Path]:
 
 
 def _file_of(module: str) -> Path | None:
-    """Return the file of a module; None where the name is that of something in a module."""
+    """Return the file of a module, or None if the name is an attribute of a module."""
     path = REPOSITORY.joinpath(*module.split("."))
     return next((file for file in (path.with_suffix(".py"), path / "__init__.py") if file.is_file()), None)
 
@@ -69,7 +69,7 @@ def _code_digest(file: Path) -> str:
     tree = copy.deepcopy(_tree(file))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
-        if isinstance(body, list):  # a lone string says something to readers alone
+        if isinstance(body, list):  # a string as a statement is documentation
             node.body = [each for each in body if not _is_text(each)]  # type: ignore[attr-defined]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 

@@ -1,1 +1,1 @@
-"""Everything that a user, a file, a network or a radio gives, and the ways in which it can be wrong."""
+"""Wrong input of every kind: from users, files, the network and the radio."""

@@ -12,7 +12,7 @@ import pytest
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description="Draw many wrong inputs of every kind.")
-    parser.add_argument("--inputs", type=int, default=2000, help="of all kinds together")
+    parser.add_argument("--inputs", type=int, default=2000, help="number of inputs, all kinds together")
     parser.add_argument("--only", default="", help="part of the name of a kind")
     given = parser.parse_args()
     os.environ["BAD_INPUTS"] = str(given.inputs)

@@ -1,6 +1,6 @@
-"""The ways in which input can be wrong: mistakes in bytes, in text, in trees of values, in columns, and in packets.
+"""Mutations of valid input: mistakes in bytes, text, trees of values, columns and packets.
 
-Each function takes the random numbers that decide, which hypothesis draws.
+Each function takes a random generator, `chance`, which hypothesis provides.
 """
 
 import json
@@ -60,7 +60,7 @@ def spoil_bytes(content: bytes, chance: Random) -> bytes:
 
 
 def _other_bytes(content: bytes, begin: int, end: int, chance: Random) -> bytes:
-    """Return what stands in the place of a part of the content."""
+    """Return the replacement for the bytes from `begin` to `end`."""
     part, kind = content[begin:end], chance.randrange(7)
     if kind == 0:
         return bytes(byte ^ 1 << chance.randrange(8) for byte in part[:20]) + part[20:]
@@ -118,7 +118,7 @@ def _spoil_rows(content: bytes, chance: Random) -> bytes:
 
 
 def _spoil_cells(content: bytes, chance: Random) -> bytes:
-    """Change one cell, or a column from there on."""
+    """Change one cell, or all cells of its column from there on."""
     lines = content.split(b"\n")
     row, column, kind = chance.randrange(len(lines)), chance.randrange(12), chance.randrange(4)
     word = chance.choice(_WORDS)
@@ -135,7 +135,7 @@ def _spoil_cells(content: bytes, chance: Random) -> bytes:
 
 
 def spoil_tree(tree: Any, chance: Random) -> Any:
-    """Return a tree of mappings and lists with one to three mistakes in it; the tree given is not changed."""
+    """Return a copy of a tree of mappings and lists with one to three mistakes."""
     tree = json.loads(json.dumps(tree))
     for _ in range(chance.choice((1, 1, 1, 2, 3))):
         places = list(_places(tree))
@@ -146,7 +146,7 @@ def spoil_tree(tree: Any, chance: Random) -> Any:
 
 
 def json_of(tree: Any, chance: Random) -> bytes:
-    """Return a tree as JSON, as lax as Python writes it, and sometimes spoiled as text."""
+    """Return a tree as Python's lax JSON, sometimes with damaged bytes."""
     text = json.dumps(tree, ensure_ascii=chance.random() < 0.7).encode("utf-8", "surrogatepass")
     return spoil_bytes(text, chance) if chance.randrange(10) == 0 else text
 
@@ -156,7 +156,7 @@ def spoil_yaml(content: bytes, chance: Random) -> bytes:
     kind = chance.randrange(4)
     if kind >= 2:
         return (spoil_bytes if kind == 2 else spoil_text)(content, chance)
-    text = json_of(spoil_tree(yaml.safe_load(content), chance), chance)  # JSON is YAML but for what is not finite
+    text = json_of(spoil_tree(yaml.safe_load(content), chance), chance)  # JSON is YAML but for NaN and infinity
     for word, own in ((b"NaN", b".nan"), (b"-Infinity", b"-.inf"), (b"Infinity", b".inf")):
         text = text.replace(word, own)
     return text
@@ -174,7 +174,7 @@ def _any_value(chance: Random, depth: int = 0) -> Any:
 
 
 def _places(tree: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield (mapping or list, key or index) of every value; of long lists a few."""
+    """Yield (mapping or list, key or index) of every value; of long lists only a few."""
     entries: Any = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for number, (key, value) in enumerate(entries):
         if number < 6 or isinstance(tree, dict) or number == len(tree) - 1:
@@ -209,7 +209,7 @@ def _spoil_at(holder: Any, key: Any, chance: Random) -> None:
 
 
 def spoil_columns(table: pa.Table, chance: Random) -> pa.Table:
-    """Return a table with one column absurd, of another type or length, gone, twice, or renamed; or other rows."""
+    """Return a table in which one column is absurd, of another type, missing, duplicated or renamed, or rows differ."""
     number, kind = chance.randrange(table.num_columns), chance.randrange(8)
     name, values = table.column_names[number], table.column(number)
     if kind == 0:
@@ -229,7 +229,7 @@ def spoil_columns(table: pa.Table, chance: Random) -> pa.Table:
         changed[row] = _other_entry(changed[row], chance)
     try:
         return table.set_column(number, name, pa.array(changed, type=values.type))
-    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):  # an entry that this column cannot hold
+    except (pa.ArrowInvalid, pa.ArrowTypeError, OverflowError):  # the column cannot hold the entry
         return table.set_column(number, name, pa.nulls(len(values), values.type))
 
 

@@ -1,4 +1,4 @@
-"""The files that cfplan reads: how a sound one is made and a wrong one of it, and what a command does with it."""
+"""The files that cfplan reads: how to make a valid one, how to spoil it, and how a command uses it."""
 
 import contextlib
 import json
@@ -51,19 +51,19 @@ from tests.recording.importers import test_import_vicon as vicon
 
 REPOSITORY = Path(__file__).parents[2]
 SAFETY, LINE = REPOSITORY / "safety.yaml", REPOSITORY / "flights" / "line.yaml"
-MADE = "made"  # the folder for what a command writes
-_LONGEST_PLANNED = 30.0  # m: planning takes its time on longer ones
-Sound = dict[str, bytes]  # the files of one sound input, by name
+MADE = "made"  # the folder for the output of a command
+_LONGEST_PLANNED = 30.0  # m: planning longer ones takes too long
+Sound = dict[str, bytes]  # the files of one valid input, by name
 
 
 @dataclass(frozen=True)
 class Input:
-    """One kind of input: `sound` makes some, `spoil` puts a wrong one into a folder, `use` does as a command does."""
+    """One kind of input: `sound` makes valid ones, `spoil` writes a wrong one to a folder, `use` acts as a command."""
 
     sound: Callable[[Path], Any]
     spoil: Callable[[Any, Random, Path], None]
     use: Callable[[Path], object]
-    fraction: float = 1.0  # of the examples that others get
+    fraction: float = 1.0  # of the usual number of examples
 
 
 def put(files: Sound, folder: Path) -> None:
@@ -79,7 +79,7 @@ def taken(folder: Path) -> Sound:
 
 
 def spoil_one_file(sound: list[Sound], chance: Random, folder: Path) -> None:
-    """Write files, one of which has mistakes of its kind."""
+    """Write the files of an input, one of them with mistakes that fit its format."""
     files = chance.choice(sound)
     wrong = chance.choice(sorted(files))
     put(files | {wrong: _spoiled(wrong, files[wrong], chance)}, folder)
@@ -104,7 +104,7 @@ def _parquet(table: pa.Table) -> bytes:
 
 
 def _is_planned(folder: Path) -> bool:
-    """Return whether an input that is read is planned with too, which takes longer: one in four, by its content."""
+    """Return whether to plan with an input that can be read, which is slow: one in four, by its content."""
     return zlib.crc32(b"".join(taken(folder).values())) % 4 == 0
 
 
@@ -200,7 +200,7 @@ def _record(folder: Path) -> Path:
 
 
 def _spoil_record(sound: Path, chance: Random, folder: Path) -> None:
-    """Write a record some of whose messages, or whose header, are wrong, or spoil the bytes of a sound one."""
+    """Write a record with wrong messages or a wrong header, or with damaged bytes."""
     file = folder / FLIGHT_FILE
     if chance.randrange(3) == 0:
         file.write_bytes(spoil_bytes(sound.read_bytes(), chance))
@@ -237,7 +237,7 @@ def _copy_with_mistakes(sound: Path, file: Path, chance: Random) -> None:
 
 
 def _use_record(folder: Path) -> None:
-    """Read a record, and make of it all that report and replay make."""
+    """Read a record, and make everything that report and replay make of it."""
     record = read_record(folder)
     summary_text(record)
     found = read_flight(folder)
@@ -254,11 +254,11 @@ def _use_record(folder: Path) -> None:
 def _model(folder: Path) -> None:
     save_model(folder, card(), weights())
     put({f"model/{name}": content for name, content in taken(folder).items()}, folder)
-    _use_model(folder)  # which loads torch's part of planning
+    _use_model(folder)  # loads the parts of planning that need torch
 
 
 def _spoil_model(_: None, chance: Random, folder: Path) -> None:
-    """Spoil card or weights; the card mostly knows the hash of the weights, as a hostile one would."""
+    """Spoil card or weights; the card mostly has the hash of the weights, as in an attack."""
     arrays, text = weights(), json.loads(json.dumps(asdict(card())))
     wrong_weights = chance.randrange(2)
     content = _wrong_weights(arrays, chance) if wrong_weights else save(arrays)
@@ -272,7 +272,7 @@ def _wrong_weights(arrays: dict[str, Any], chance: Random) -> bytes:
     values = arrays[name]
     if kind == 0:
         return spoil_bytes(save(arrays), chance)
-    if kind == 1:  # the header, which names types, shapes and places
+    if kind == 1:  # the header with types, shapes and offsets
         content = save(arrays)
         (size,) = struct.unpack_from("<Q", content)
         head = json_of(spoil_tree(json.loads(content[8 : 8 + size]), chance), chance)
@@ -286,7 +286,7 @@ def _wrong_weights(arrays: dict[str, Any], chance: Random) -> bytes:
 
 
 def _use_model(folder: Path) -> None:
-    """Find a model, load it, and plan by it."""
+    """Find a model, load it, and plan with it."""
     limits = load_limits(SAFETY)
     find_model(limits.airframe, limits.plan, (folder,))
     model = load_model(folder / "model")
@@ -326,7 +326,7 @@ def _vicon(folder: Path) -> list[Sound]:
 
 
 def _spoil_sd(sound: bytes, chance: Random, folder: Path) -> None:
-    """Spoil a log of the microSD card, mostly with a checksum that fits."""
+    """Spoil a log of the microSD card, mostly with a correct checksum."""
     content = spoil_bytes(sound, chance)
     put({"log": content + (struct.pack("<I", zlib.crc32(content)) if chance.randrange(4) else b"")}, folder)
 
@@ -351,7 +351,7 @@ def _bags(folder: Path) -> list[Sound]:
 
 
 def _first_bag(folder: Path) -> list[Sound]:
-    """Return a bag of ROS 1."""
+    """Return a ROS 1 bag."""
     types, kind = logs.store(), "geometry_msgs/msg/PoseStamped"
     with Ros1Writer(folder / "first.bag") as writer:
         topic = writer.add_connection("/cf1/pose", kind, typestore=types)
@@ -363,7 +363,7 @@ def _first_bag(folder: Path) -> list[Sound]:
 
 
 def _use_log(name: str, folder: Path) -> None:
-    """Read a log, lay each subject over a plan, and draw them all, as replay does."""
+    """Read a log, align each subject with a plan, and draw them all, as replay does."""
     log = read_log(folder / name)
     log.select([subject.name for subject in log.subjects])
     for subject in log.subjects[:5]:

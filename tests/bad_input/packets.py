@@ -1,6 +1,6 @@
-"""What comes over the network and the radio: MAVLink, DataStream and CRTP, to the real clients in this process.
+"""Packets from the network and the radio: MAVLink, DataStream and CRTP, for the real clients in this process.
 
-An input is a file of packets, each behind its length.
+An input is a file of packets, each preceded by its length.
 """
 
 import contextlib
@@ -49,7 +49,7 @@ from tests.bad_input.faults import FLOATS, TEXTS, spoil_bytes, spoil_packets
 from tests.bad_input.files import MADE, SAFETY, Input
 
 _LARGEST_DATAGRAM = 65_000  # bytes
-_SINGLES = [value for value in FLOATS if not 3e38 < abs(value) < math.inf]  # what 32 bits hold
+_SINGLES = [value for value in FLOATS if not 3e38 < abs(value) < math.inf]  # finite in 32 bits, or not finite at all
 
 
 def _put(packets: list[bytes], folder: Path) -> None:
@@ -75,7 +75,7 @@ _INTEGERS = {"uint8_t": 1, "int8_t": 1, "uint16_t": 2, "int16_t": 2, "uint32_t":
 
 
 def _spoil_mavlink(_: None, chance: Random, folder: Path) -> None:
-    """Write datagrams of messages whose every field is absurd, and of damaged bytes."""
+    """Write datagrams: messages with absurd values in every field, and damaged bytes."""
     mav = common.MAVLink(None, srcSystem=chance.choice((0, 1, 255)), srcComponent=chance.choice((0, 1, 190)))
     found = []
     for _ in range(chance.randint(1, 6)):
@@ -101,7 +101,7 @@ def _field(kind: str, count: int, chance: Random) -> Any:
 
 
 def _use_mavlink(folder: Path) -> None:
-    """Let the bridge hear and answer while the pilot reports."""
+    """Run the bridge on the datagrams while the pilot reports."""
     clock = SteppedClock()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
         station.bind(("127.0.0.1", 0))
@@ -130,7 +130,7 @@ def _pair() -> tuple[socket.socket, socket.socket]:
 
 
 def _datastream(_: Path) -> list[bytes]:
-    """Return what a client sends, then what a server sends: what it offers, then frames."""
+    """Return the messages of a client, then those of a server: its offer, then frames."""
     theirs, ours = _pair()
     with theirs, ours:
         server = Connection(theirs, spare=False)
@@ -154,7 +154,7 @@ def _datastream(_: Path) -> list[bytes]:
 
 
 def _spoil_datastream(sound: list[bytes], chance: Random, folder: Path) -> None:
-    """Write a stream with absurd blocks whose lengths mostly fit, so that they are read."""
+    """Write a stream of absurd blocks, mostly with correct lengths, so that they are read."""
     packets = [_spoiled_packet(packet, chance) if chance.randrange(25) == 0 else packet for packet in sound]
     _put(spoil_packets(packets, chance) if chance.randrange(3) == 0 else packets, folder)
 
@@ -183,7 +183,7 @@ def _spoiled_packet(content: bytes, chance: Random) -> bytes:
 
 
 class _Feed:
-    """A feed of messages that have come already."""
+    """A feed of given messages."""
 
     stage, child_id = "", None
 
@@ -203,7 +203,7 @@ class _Feed:
 
 
 def _use_datastream(folder: Path) -> None:
-    """Feed the client; survey, classify and gate what it gives; and let the virtual server hear the same bytes."""
+    """Feed the client; survey, classify and gate its poses; and send the same bytes to the virtual server."""
     content = b"".join(_packets(folder))
     theirs, ours = _pair()
     with theirs, ours:
@@ -232,7 +232,7 @@ def _use_datastream(folder: Path) -> None:
 
 
 def _heard(content: bytes) -> list[Any]:
-    """Return what the driver's process sends of this stream, through its pipe and back."""
+    """Return the messages that the driver's process makes of a stream, after a round trip through its pipe."""
     pipe, received = bytearray(), 1000.0
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
@@ -249,7 +249,7 @@ def _heard(content: bytes) -> list[Any]:
         try:
             client.connect()
             while True:
-                received += 0.005  # s, as if it came at its rate
+                received += 0.005  # s, as if frames came at their rate
                 frame = replace(client.wait(), received=received)
                 if (scene := client.scene()) is not None:
                     pipe += child.encoded(scene)
@@ -278,7 +278,7 @@ def _values(chance: Random, layout: str) -> bytes:
     return found
 
 
-# Port, channel, first bytes, and the layout of what follows, of the packets that a vehicle knows.
+# Port, channel, first bytes, and layout of the rest, of the packets that a vehicle knows.
 _COMMANDS_OF_VEHICLES = (
     (7, 0, b"\x06", "hhhhhhhhhIhhh"), (7, 0, b"\x01", "ffff"), (7, 0, b"\x02", "fffff"), (7, 0, b"\x04", "ffff"),
     (7, 0, b"\x05", "ffff"), (7, 0, b"\x07", "ffff"), (7, 0, b"\x09", "ffff"), (7, 0, b"\x0a", "ffff"),
@@ -311,7 +311,7 @@ def _spoil_uplink(_: None, chance: Random, folder: Path) -> None:
 
 
 def _use_uplink(folder: Path) -> None:
-    """Send the packets to a virtual vehicle, 10 ms apart, and fly on for a second."""
+    """Send the packets to a virtual vehicle, 10 ms apart, and simulate one more second."""
     packets = _packets(folder)
     old = sum(map(len, packets)) % 4 == 0
     settings = VehicleSettings(firmware="2025.02", protocol=10) if old else VehicleSettings()
@@ -330,11 +330,11 @@ def _use_uplink(folder: Path) -> None:
 
 
 class _Driver(CRTPDriver):
-    """A link to a virtual vehicle in this process; packets can be slipped in between its answers, or spoiled."""
+    """A link to a virtual vehicle in this process; packets can be inserted between its answers, or spoiled."""
 
     needs_resending = False
-    made: "_Driver"  # the last
-    spoil = staticmethod(lambda packet: packet)  # of what comes from the vehicle
+    made: "_Driver"  # the last instance
+    spoil = staticmethod(lambda packet: packet)  # applied to each packet from the vehicle
 
     def connect(self, uri: str, statistics: object, error: object) -> None:
         if not uri.startswith("spoiled://"):
@@ -371,7 +371,7 @@ class _Driver(CRTPDriver):
 
 
 class _Tracebacks(logging.Handler):
-    """Keeps what cflib logs of exceptions in callbacks that are cfplan's."""
+    """Keeps the exceptions in cfplan's callbacks that cflib logs."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -419,7 +419,7 @@ def _spoil_downlink(_: None, chance: Random, folder: Path) -> None:
 
 
 def _use_downlink(folder: Path) -> None:
-    """Slip packets in between the answers of a vehicle; what the link tells must stay finite, and its thread alive."""
+    """Insert packets between a vehicle's answers; the link's values must stay finite, and its thread alive."""
     at, tracebacks = _connected(), _tracebacks()
     at.heard.clear()
     at.driver.pump(10)
@@ -439,7 +439,7 @@ def _use_downlink(folder: Path) -> None:
 
 
 def _use_connecting(folder: Path) -> None:
-    """Connect to a vehicle some of whose answers are spoiled, set a parameter and start the logs."""
+    """Connect to a vehicle with some spoiled answers, set a parameter and start the logs."""
     chance, tracebacks, looks = Random((folder / "packets").read_bytes()), _tracebacks(), 0
     fraction = chance.choice((0.002, 0.02, 0.3))
 

@@ -22,25 +22,25 @@ from tests.bad_input.packets import PACKETS
 
 INPUTS = FILES | PACKETS
 EXAMPLES = int(os.environ.get("BAD_INPUTS", "600")) / sum(kind.fraction for kind in INPUTS.values())
-PLANNED = ("paths", "points", "polynomials", "samples", "safety", "airframes")  # what is read well may be infeasible
-_PROCESSOR_TIME = 10.0  # s for one input; others may have the processor meanwhile
+PLANNED = ("paths", "points", "polynomials", "samples", "safety", "airframes")  # valid input may be infeasible
+_PROCESSOR_TIME = 10.0  # s for one input, not counting other processes
 _MOST_MEMORY = 1_000_000  # kB for one input
-_ADDRESSES = 6 << 30  # bytes that one input may reserve: the machine is not filled
+_ADDRESSES = 6 << 30  # bytes of address space for one input, so that it cannot exhaust the machine
 _LONGEST_MESSAGE = 2000  # characters
 
 
 @pytest.mark.parametrize("name", INPUTS)
 def test_wrong_input_is_read_or_refused_with_place_and_hint(tmp_path, name):
-    kind, folder = INPUTS[name], tmp_path / "input"  # where the one that failed is left
+    kind, folder = INPUTS[name], tmp_path / "input"  # a failing input is left there
     sound = kind.sound(tmp_path)
-    for number in range(3):  # what is loaded and compiled once is counted to no input
+    for number in range(3):  # loading and compiling do not count for any input
         with suppress(Exception):
             kind.spoil(sound, Random(number), emptied(folder))
             kind.use(folder)
 
     @settings(
         max_examples=max(3, round(EXAMPLES * kind.fraction)), deadline=None, suppress_health_check=list(HealthCheck),
-        phases=(Phase.reuse, Phase.generate),  # making an input smaller would take minutes
+        phases=(Phase.reuse, Phase.generate),  # shrinking an input would take minutes
     )  # fmt: skip
     @given(chance=st.randoms(use_true_random=False))
     def check(chance: Random) -> None:
@@ -79,13 +79,13 @@ def check_refusal(error: CfplanError, name: str, folder: Path) -> None:
 
 @contextmanager
 def bounded():
-    """Bound processor time and memory; a warning that would reach the user's terminal is an error."""
+    """Limit processor time and memory, and turn warnings that would reach the user's terminal into errors."""
 
     def too_long(*_):
         raise AssertionError(f"more than {_PROCESSOR_TIME:g} s")
 
     before, limits = _status("VmRSS"), resource.getrlimit(resource.RLIMIT_AS)
-    Path("/proc/self/clear_refs").write_text("5")  # the peak of memory begins anew
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak memory
     resource.setrlimit(resource.RLIMIT_AS, (1024 * _status("VmSize") + _ADDRESSES, limits[1]))
     handler = signal.signal(signal.SIGVTALRM, too_long)
     signal.setitimer(signal.ITIMER_VIRTUAL, _PROCESSOR_TIME)

@@ -9,7 +9,7 @@ import pytest
         (["check"], "Missing argument 'PATH_OR_PLAN' (or --example)"),
         (["sim", "--example", "line", "flights/line.yaml"], "both a path and an example"),
         (["fly"], "neither a path nor waypoints"),
-        (["fly", "--example", "line", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "only in a room of yours"),
+        (["fly", "--example", "line", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "only with an explicit safety.yaml"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -1,4 +1,4 @@
-"""The study of dry runs: by motor lag, how far the vehicle deviates from plans of flights/."""
+"""The study of dry runs: deviations from plans of flights/, by motor lag."""
 
 from dataclasses import replace
 from pathlib import Path

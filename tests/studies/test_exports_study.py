@@ -9,7 +9,7 @@ from studies.exports import STUDY, Settings
 from studies.runner.cases import run_study
 
 REPOSITORY = Path(__file__).parents[2]
-WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed
+WORSE = 0.02  # m, largest excess of the deviation over that of the same plan streamed
 
 pytestmark = pytest.mark.integration
 
@@ -42,7 +42,7 @@ def test_the_flight_lands_and_is_slower_for_the_fall(result):
     assert row["time_lost"] > 0.0
 
 
-def test_a_path_that_cannot_be_exported_is_told_and_the_others_go_on(result):
+def test_a_path_that_cannot_be_exported_is_listed_with_its_reason_and_the_others_go_on(result):
     rows = result.table("refused").rows
     assert [(row["path"], row["what"]) for row in rows] == [
         ("through-the-floor", "exports"),

@@ -1,4 +1,4 @@
-"""Flights in real time: what failed is counted and told, the rest is measured, and an interrupt keeps it."""
+"""Flights in real time: failures are counted and listed, the others are measured, and an interrupt keeps them."""
 
 from dataclasses import replace
 from functools import partial
@@ -22,7 +22,7 @@ REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
 STILL, LEVEL = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 START = 100.0  # s, of the stream
-OFF = 0.03  # m, by which the vehicle is beside its plan
+OFF = 0.03  # m, distance of the vehicle from its plan
 
 
 def outcome(code=ExitCode.OK, failed=(), deviation=OFF):
@@ -34,7 +34,7 @@ def outcome(code=ExitCode.OK, failed=(), deviation=OFF):
 
 
 class Lab:
-    """Nothing but what the study asks of one."""
+    """The part of a lab that the study uses."""
 
     uri, number = "sim://0", 0
 
@@ -52,7 +52,7 @@ class Lab:
 
 
 def study(*ends, files=(LINE,), **settings):
-    """The result of flights that are not flown, each ends as the next of `ends` does, and the labs of each."""
+    """Return the study's result for faked flights, which end like `ends` in order, and the conditions of each lab."""
     left, labs = list(ends), []
 
     def fly(mission, *, on_telemetry, **_):
@@ -68,11 +68,11 @@ def study(*ends, files=(LINE,), **settings):
 
     def lab(mission, conditions):
         labs.append(conditions)
-        told = decode(mission.payloads)
+        sent = decode(mission.payloads)
         time = START + mission.lead + np.arange(len(mission.payloads)) / 100  # setpoints are ahead of the plan
-        beside = told.position + np.array([OFF, 0.0, 0.0])
+        beside = sent.position + np.array([OFF, 0.0, 0.0])
         zero = np.zeros(len(time))
-        return Lab(Truth(time, beside, told.velocity, told.quaternion, told.body_rate, zero, zero, zero, False))
+        return Lab(Truth(time, beside, sent.velocity, sent.quaternion, sent.body_rate, zero, zero, zero, False))
 
     parts = partial(work, fly=partial(fly_in_real_time, pilot=fly, start=lab))
     result = run_study("flights", "studies.flights", replace(STUDY, work=parts), Settings(files, **settings))
@@ -94,7 +94,7 @@ def test_deviation_is_by_poses_and_by_the_truth_and_time_is_that_of_the_setpoint
     assert flight.off_plan < 0.01
 
 
-def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_told():
+def test_mean_and_worst_are_over_the_flights_that_landed_and_the_others_are_listed():
     ends = outcome(deviation=0.02), outcome(deviation=0.06), outcome(ExitCode.ENDED_BY_SAFETY), LinkError("gone")
     plans, table, failures = (table.cells() for table in study(*ends, repeats=4)[0].tables)
     assert len(plans[1]) == 1

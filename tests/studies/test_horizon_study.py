@@ -16,11 +16,11 @@ CORNERS = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0,
 def test_with_all_waypoints_known_nothing_is_lost(limits):
     roomy = replace(limits, space=replace(limits.space, low=(-9.0, -9.0, -9.0), high=(9.0, 9.0, 9.0)))
     path = min_snap(CORNERS, times=centripetal_times(CORNERS))
-    whole = plan(path, roomy.airframe, roomy, planner="expert").trajectory.duration
-    assert fly_knowing(CORNERS, 4, roomy) == (pytest.approx(whole), 0)
+    reference = plan(path, roomy.airframe, roomy, planner="expert").trajectory.duration
+    assert fly_knowing(CORNERS, 4, roomy) == (pytest.approx(reference), 0)
     knowing_two, stops = fly_knowing(CORNERS, 2, roomy)
     assert stops == 0
-    assert 0.7 * whole < knowing_two < 1.2 * whole  # its curve may be the faster one
+    assert 0.7 * reference < knowing_two < 1.2 * reference  # its curve may be the faster one
     at_each = sum(fly_knowing(CORNERS[place : place + 2], 1, roomy)[0] for place in range(4))
     assert knowing_two < 0.9 * at_each
 

@@ -1,4 +1,4 @@
-"""The study of identification: how vehicles that were drawn are counted, and how well they are known."""
+"""The study of identification: the count of drawn vehicles, and the errors of identification."""
 
 import math
 from dataclasses import replace

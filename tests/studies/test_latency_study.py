@@ -1,4 +1,4 @@
-"""The study of latency: which setpoint is the first that another plan changes, and what the tables say of it."""
+"""The study of latency: the first setpoint that a new plan changes, and the tables."""
 
 from types import SimpleNamespace
 
@@ -19,7 +19,7 @@ def rows(*values):
         (2, rows(2, 3, 4), None),  # the same as before
         (2, rows(2, 3, 9, 9), 4),
         (2, rows(2, 8, 4), 3),
-        (3, rows(3, 4, 4, 4), None),  # behind the end the last one holds
+        (3, rows(3, 4, 4, 4), None),  # beyond the end the last one is repeated
         (3, rows(3, 4, 4, 7), 6),
         (9, rows(4, 5), 10),
     ],
@@ -46,13 +46,13 @@ def test_its_table_has_a_row_for_each_delay():
     assert [(row["what"], row["rate"]) for row in found["rate"]] == [("hovering, no requests", 0.0)]
 
 
-def test_where_nothing_was_accepted_that_is_said():
+def test_without_any_accepted_request_it_is_an_error():
     flight = SimpleNamespace(heard=[], committed=[], sent={})
     with pytest.raises(InputError, match="no request was accepted"):
         find_replans(flight, {})
 
 
-def test_the_parts_of_the_time_are_told_apart():
+def test_the_parts_of_the_time_are_measured_separately():
     replans = [replan(0.1, 0.2, 0.08, 0.001, 0.0, 0.02, 0.04, 0.01 * k, 0.02) for k in range(11)]
     rows = {row["what"]: row for row in tables(replans)["budget"]}
     assert rows["plan"]["median"] == pytest.approx(0.02)

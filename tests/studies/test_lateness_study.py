@@ -1,4 +1,4 @@
-"""Lateness: of a sleeper and of the stream, with and without going first; who gives that up has given it up."""
+"""Lateness of a sleeper and of the stream, with and without SCHED_FIFO; dropping the permission is final."""
 
 import math
 import subprocess
@@ -56,7 +56,7 @@ class KnownSleeper:
 
 
 def streamed(late, skipped):
-    """A flight that streamed for a fifth of a second, each setpoint late by as much."""
+    """Return a flight that streamed for 0.2 s, with each setpoint late by `late`."""
     due = [100.0 + index / 100 for index in range(20)]
     sent = [SetpointSent(when + late, when, index, *[STILL] * 3, LEVEL, STILL) for index, when in enumerate(due)]
     outcome = FlightOutcome(
@@ -67,7 +67,7 @@ def streamed(late, skipped):
 
 
 def study(*flights, permitted=True):
-    """The study of flights that are not flown; nothing is given up, as other tests may need it."""
+    """Run the study on faked flights, without dropping the priority, which other tests may need."""
     ends, given_up = list(flights), []
     parts = partial(
         work, fly=lambda *_, **__: ends.pop(0), sleeper=KnownSleeper, permitted=lambda: permitted,
@@ -98,7 +98,7 @@ def test_percentiles_are_those_of_the_setpoints():
     assert row.seconds == 10.0
 
 
-def test_what_did_not_fly_is_told():
+def test_a_flight_that_failed_is_listed_with_its_reason():
     result = study(refused("the vehicle is gone"), refused("too late"))
     assert [row.reason for row in result.rows] == ["", "the vehicle is gone", "", "too late"]
     assert "the vehicle is gone" in result.tables[0].cells()[1][1]
@@ -115,7 +115,7 @@ def test_after_giving_priority_up_no_child_can_have_it():
 
 
 @pytest.mark.parametrize("shortened", [{"reason": "poses stopped"}, {"view_failure": "the live view ended: closed"}])
-def test_a_stream_or_view_that_ends_early_is_measured_as_far_as_it_came_and_told(shortened):
+def test_a_stream_or_view_that_ends_early_is_measured_until_then_with_its_reason(shortened):
     row = replace(WakeUps.of("stream", ORDINARY, [1e-4] * 300), **shortened)
     (table,) = STUDY.tables(None, [row])
     assert {"3 s", *shortened.values()} <= set(table.cells()[1][0])

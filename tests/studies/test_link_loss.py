@@ -12,7 +12,7 @@ REPOSITORY = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def line():
-    """The line's rows, at two speeds."""
+    """Return the line's rows at two speeds."""
     settings = Settings((REPOSITORY / "flights" / "line.yaml",), speeds=(1.0, 0.3))
     return run_study("link-loss", "studies.link_loss", STUDY, settings).table("link-loss").rows
 

@@ -30,7 +30,7 @@ AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
 
 @pytest.fixture(scope="module")
 def path_file(tmp_path_factory):
-    """A path so short that RotorPy flies it in a second."""
+    """Return a path so short that RotorPy flies it in a second."""
     file = tmp_path_factory.mktemp("physics") / "short.yaml"
     file.write_text("name: short\nwaypoints:\n  - [0, 0, 1]\n  - [0.25, 0.15, 1.1]\n")
     return file
@@ -67,7 +67,7 @@ def test_rotorpy_and_the_dry_run_are_a_centimetre_apart_at_most(result):
         assert abs(flight.deviation - flight.own_deviation) <= flight.apart
 
 
-def test_a_body_that_is_heavier_than_believed_is_told_apart(path_file):
+def test_a_body_that_is_heavier_than_assumed_deviates(path_file):
     def heavy(airframe):
         return rotorpy_body(replace(airframe, mass=1.2 * airframe.mass), REALISTIC_LAG)
 
@@ -88,7 +88,7 @@ def test_the_identified_model_moves_as_the_airframe_does():
     np.testing.assert_allclose(rolled[:6], own[:6], atol=0.1 * np.abs(own[4]))
 
 
-def test_an_airframe_that_drone_models_does_not_know_is_said():
+def test_an_airframe_that_drone_models_does_not_know_is_refused():
     with pytest.raises(InputError, match=r"does not know crazyflie-2\.0"):
         identified_body(AIRFRAMES["crazyflie-2.0"])
 

@@ -1,4 +1,4 @@
-"""The study of random faults: its tables count flights by their faults and phases, and show what went wrong."""
+"""The study of random faults: its tables count flights by faults and phases, and list the failed ones."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A sleeper measures what the computer does to every program."""
+"""A sleeper measures the latency that the computer imposes on every program."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from studies.sleeper import Sleeper
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="this system does not tell who waits")
+@pytest.mark.skipif(not Path("/proc/self/schedstat").is_file(), reason="this system does not report run-queue times")
 def test_a_sleeper_notes_its_deadlines_and_how_long_a_process_waits_for_its_processor():
     processor = {min(os.sched_getaffinity(0))}
     busy = "import time; end = time.monotonic() + 1.5\nwhile time.monotonic() < end: pass"

@@ -1,4 +1,4 @@
-"""The study of random requests: a flight passes, and what is wrong with a flown sequence is found."""
+"""The study of random requests: a flight passes, and faults of a flown sequence are found."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from studies.steering import STUDY, Settings, WatchedSteering, fly_steered
 
 @pytest.fixture(scope="module")
 def flown(limits):
-    """A flight of some requests as judged, and what was sent and committed in it."""
+    """Return the verdict on a flight with some requests, its setpoints and its commitments."""
     kept = []
 
     def judge(*given):
@@ -92,7 +92,7 @@ def test_what_is_wrong_with_a_commitment_is_found(flown, limits):
 
 
 def test_what_is_flown_later_than_proposed_is_judged_without_what_it_replaced(limits):
-    """A plan from rest, replaced before it begins by one that arrives for three setpoints later: nobody flies it."""
+    """A plan from rest is not flown if it is replaced, before it begins, by one that is delayed by three setpoints."""
     flight = WatchedSteering(limits, planning=0.1, seed=5, vehicle=VehicleSettings(seed=5))
     with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
         vehicle.take_off(1.0)

@@ -1,4 +1,4 @@
-"""The study of stops: straight on from full speed, those that a request does not try lean too far."""
+"""The study of stops: from full speed, stops shorter than those that a request tries lean too far."""
 
 import pytest
 
@@ -12,7 +12,7 @@ def result():
 
 
 def test_the_stop_that_is_flown_takes_hardly_more_way_than_the_fastest_plan_to_brake(result):
-    """Though it is certified from any moment on, without a search; 10 % is what it may take more."""
+    """The distance may be 10 % longer, as stops are certified for every moment without a search."""
     [_, stop], [braking] = result.table("stops").rows, result.table("braking").rows
     assert braking["acceleration"] <= 5.0
     assert braking["turning"] <= 35.0

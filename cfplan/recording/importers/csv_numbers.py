@@ -11,9 +11,9 @@ from pyarrow import csv
 
 from cfplan.errors import InputError
 
-_BLOCK = 1 << 20  # bytes that one core takes; they fit into its cache
+_BLOCK = 1 << 20  # bytes per task, which fit into a core's cache
 _LONGEST_CELL = 64  # bytes
-_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # what a cell without a value holds
+_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # contents of a cell without a value
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGNORECASE | re.ASCII)
 
 
@@ -23,9 +23,9 @@ def read_numbers(
 ) -> tuple[dict[int | str, NDArray], bool]:  # fmt: skip
     """Return each of `columns`, NaN for empty cells, and whether the last line was cut off, which is then left out.
 
-    Lines from byte `begin` to `end` have `width` cells each; `point` is that of the decimals.
+    Lines from byte `begin` to `end` have `width` cells each; `point` is the decimal separator.
 
-    Raises InputError with the file's line where one has another number of cells, or a cell of `columns` is no number.
+    Raises InputError, with the line number, if a line has another number of cells, or a cell is not a number.
     """
     if begin == end:
         return {column: np.empty(0) for column in columns}, False
@@ -60,7 +60,7 @@ def line_at(data: bytes, offset: int) -> int:
 def _mistake(
     data: bytes, begin: int, end: int, columns: Sequence[int], width: int, where: str, delimiter: str, point: str
 ) -> InputError:
-    """Find the first line, and the cell in it, that is not a row of numbers."""
+    """Return the error for the first line, and the cell in it, that cannot be read."""
     with_point = str.maketrans({point: ".", ".": point})
     for number, line in enumerate(io.BytesIO(data[begin:end]), line_at(data, begin)):
         text = line.decode("utf-8", errors="replace").strip("\r\n")

@@ -1,4 +1,4 @@
-"""The log formats that can be read, recognised by a file's content, not by its name."""
+"""Read logs of all known formats, recognised by a file's content, not by its name."""
 
 from pathlib import Path
 from types import ModuleType
@@ -9,17 +9,17 @@ from cfplan.recording.importers.mocap_log import MocapLog
 from cfplan.recording.importers.vicon_csv import Rotations
 from cfplan.recording.plausible import check_places, check_times
 
-_HEAD = 4096  # bytes by which a format is recognised
+_HEAD = 4096  # bytes of a file that identify its format
 
-# Each has its name FORMAT, HEAD that matches the first bytes of a file, read(file), and EXTRA if it needs one.
+# Each defines FORMAT, its name; HEAD, which matches a file's first bytes; read(file); and EXTRA, if it needs one.
 IMPORTERS = (usd_log, ros_bag, tlog, named_csv, vicon_csv)
 
 
 def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
-    """Read the log in a file or in a bag's folder; `rotations`: of a Vicon CSV whose header does not say.
+    """Read the log in a file or in a bag's folder; `rotations` is for a Vicon CSV whose header does not say.
 
     Raises:
-        InputError: not there, empty, of no known format, damaged, or without any pose.
+        InputError: the log is missing, empty, of unknown format, damaged, or without any pose; or a package is missing.
     """
     file = Path(file)
     importer = find_importer(file)
@@ -41,7 +41,7 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
 
 
 def find_importer(file: Path) -> ModuleType:
-    """Return the importer that recognises the file. Raises InputError if absent, empty, or of no known format."""
+    """Return the importer that recognises the file. Raises InputError if it is absent, empty, or of unknown format."""
     if (file / "metadata.yaml").is_file():
         return ros_bag
     head = b"" if file.is_dir() else _first_bytes(file)

@@ -1,6 +1,6 @@
-"""The poses of each subject in a log of motion capture or of a vehicle, and how columns of a table become one.
+"""The poses of each subject in a log of motion capture or of a vehicle, and their construction from table columns.
 
-A format declares in a table which of its columns holds which channel, in which unit; `subject` does the rest.
+A format declares which of its columns holds which channel, in which unit; `subject` builds the poses.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
 
-Table = Mapping[Any, NDArray]  # columns, (N,) each, by a format's own keys; times, in s, are "t"
+Table = Mapping[Any, NDArray]  # columns, (N,) each, by the format's keys; "t" holds times, s
 Columns = Mapping[str, tuple[Any, float]]  # channel: the key of its column, and the factor to SI units
 
 PLACE = ("x", "y", "z")
@@ -22,10 +22,10 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 YAW_PITCH_ROLL = ("yaw", "pitch", "roll")  # about z, then the turned y, then the turned x
 ROTATION_VECTOR = ("rx", "ry", "rz")
 EULER_XYZ = ("ex", "ey", "ez")  # about x, then the turned y, then the turned z
-POSE: Columns = {channel: (channel, 1.0) for channel in (*PLACE, *QUATERNION)}  # of tables that use our own names
+POSE: Columns = {channel: (channel, 1.0) for channel in (*PLACE, *QUATERNION)}  # for tables that use these names
 
-_LISTED = 12  # names that an error lists at most
-_LENGTH_TOLERANCE = 0.05  # of a quaternion whose length must be 1
+_LISTED = 12  # most names that an error lists
+_LENGTH_TOLERANCE = 0.05  # on the length of a quaternion, which must be 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,12 +39,12 @@ class LoggedSubject:
 
     @property
     def seen(self) -> NDArray:
-        """Return (N,) whether there is a position."""
+        """Return where the position is known, (N,) bool."""
         return np.isfinite(self.position).all(axis=1)
 
     @property
     def duration(self) -> float:
-        """Return s from the first row to the last."""
+        """Return the time from the first row to the last, s."""
         return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
 
 
@@ -54,11 +54,11 @@ class MocapLog:
 
     format: str
     subjects: tuple[LoggedSubject, ...]
-    notes: tuple[str, ...]  # what was assumed and what is missing, one sentence each
-    truncated: bool  # the file ends before its time; the subjects hold all that can be read
+    notes: tuple[str, ...]  # assumptions and missing data, one sentence each
+    truncated: bool  # the file is cut off; the subjects hold everything before that
 
     def select(self, names: Sequence[str], *, where: str = "") -> tuple[LoggedSubject, ...]:
-        """Return the subjects of these names, all where none is given. Raises InputError that lists the known names."""
+        """Return the subjects with these names, or all without any. Raises InputError that lists the known names."""
         by_name = {subject.name: subject for subject in self.subjects}
         missing = [name for name in names if name not in by_name]
         if missing:
@@ -68,18 +68,18 @@ class MocapLog:
 
 
 def in_order(table: Table, rows: str, notes: list[str]) -> Table:
-    """Return the rows whose time is later than all before it; a note counts the others of these `rows`."""
+    """Return the rows whose times increase; append a note that counts the dropped ones, which it calls `rows`."""
     time = table["t"]
     latest = np.maximum.accumulate(np.where(np.isfinite(time), time, -np.inf))
     keep = np.isfinite(time) & (time > np.r_[-np.inf, latest[:-1]])
     if keep.all():
         return table
-    notes.append(f"{np.sum(~keep)} {rows} left out, as their times do not grow")
+    notes.append(f"{np.sum(~keep)} {rows} left out, as their times do not increase")
     return {key: column[keep] for key, column in table.items()}
 
 
 def subject(name: str, table: Table, columns: Columns = POSE, *, where: str = "") -> LoggedSubject:
-    """Return the poses that the columns hold; those of an attitude may be absent.
+    """Return the poses in the columns; attitude columns may be absent.
 
     Raises InputError, if `where` names the file, at the first quaternion whose length is neither 1 nor 0.
     """
@@ -90,7 +90,7 @@ def subject(name: str, table: Table, columns: Columns = POSE, *, where: str = ""
 
 
 def attitude(channels: Table) -> NDArray:
-    """Return (N, 4) quaternions of the channels of an attitude, NaN where they state none."""
+    """Return the attitude in the channels as quaternions, (N, 4), NaN where there is none."""
     for names, quaternion in _ATTITUDES.items():
         if channels.keys() >= set(names):
             return quaternion(_stack(channels, names))
@@ -98,7 +98,7 @@ def attitude(channels: Table) -> NDArray:
 
 
 def quaternions(values: NDArray, rotation: Callable[[NDArray], Rotation]) -> NDArray:
-    """Return (N, 4) of the rotation that each row states, NaN where one of its values is not finite."""
+    """Return the rotation of each row as a quaternion, (N, 4), NaN where one of its values is not finite."""
     quaternion = np.full((len(values), 4), np.nan)
     known = np.isfinite(values).all(axis=1)
     if known.any():
@@ -107,13 +107,13 @@ def quaternions(values: NDArray, rotation: Callable[[NDArray], Rotation]) -> NDA
 
 
 def _unit_quaternions(quaternion: NDArray) -> NDArray:
-    """Return them (N, 4) with length 1; NaN where that is 0 or not finite, as in logs where nothing was seen."""
+    """Return quaternions, (N, 4), of length 1; NaN where the length was 0 or not finite, as in rows without a pose."""
     with np.errstate(all="ignore"):
         length = np.linalg.norm(quaternion, axis=1, keepdims=True)
         return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)
 
 
-_ATTITUDES: dict[tuple[str, ...], Callable[[NDArray], NDArray]] = {  # the first whose channels are there is taken
+_ATTITUDES: dict[tuple[str, ...], Callable[[NDArray], NDArray]] = {  # the first whose channels are present is used
     QUATERNION: _unit_quaternions,
     YAW_PITCH_ROLL: partial(quaternions, rotation=partial(Rotation.from_euler, "ZYX")),
     ROTATION_VECTOR: partial(quaternions, rotation=Rotation.from_rotvec),

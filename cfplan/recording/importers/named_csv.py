@@ -1,6 +1,6 @@
-"""Read a CSV whose first line names its columns: one vehicle a file, time, place and, if there, attitude, in SI units.
+"""Read a CSV whose first line names its columns: time, position and optional attitude of one vehicle, in SI units.
 
-crazyswarm2 writes `timestamp,x,y,z,qw,qx,qy,qz`, and `cfplan export --to samples` `t`, places, velocities and more.
+crazyswarm2 writes `timestamp,x,y,z,qw,qx,qy,qz`; `cfplan export --to samples` writes `t`, position, velocity and more.
 """
 
 import re
@@ -11,19 +11,19 @@ from cfplan.recording.importers.csv_numbers import read_numbers
 from cfplan.recording.importers.mocap_log import PLACE, QUATERNION, MocapLog, in_order, subject
 
 FORMAT = "CSV of t, x, y, z"
-TIMES = ("t", "time", "timestamp")  # what the column of times may be called
+TIMES = ("t", "time", "timestamp")  # possible names of the time column
 _COLUMN = r"(?=(?:[^\n]*,)?[ \t\"]*(?:%s)[ \t\"]*(?:[,\r\n]|\Z))"  # in the first line
 HEAD = re.compile((r"(?:\xef\xbb\xbf)?" + _COLUMN % "|".join(TIMES) + _COLUMN % "x|qw").encode())
 
 
 def read(file: Path) -> MocapLog:
-    """Read the one vehicle, named as the file is. Raises InputError where a column is missing or a number is none."""
+    """Read the vehicle, named after the file. Raises InputError if a column is missing or a cell is not a number."""
     data = file.read_bytes()
     begin = data.find(b"\n") + 1 or len(data)
     names = _names(data[:begin])
     channels = PLACE + (QUATERNION if set(QUATERNION) & set(names) else ())
     if missing := [name for name in channels if name not in names]:
-        hint = "the first line names the columns t, x, y, z, and where attitudes are known qx, qy, qz and qw"
+        hint = "the first line must name the columns t, x, y, z and, for attitudes, qx, qy, qz and qw"
         raise InputError(f"there is no column {', '.join(missing)}", where=f"{file}:1", hint=hint)
     time = names.index(next(name for name in TIMES if name in names))
     columns = {channel: (names.index(channel), 1.0) for channel in channels}

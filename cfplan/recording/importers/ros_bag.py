@@ -1,4 +1,4 @@
-"""Read ROS 2 bags (and ROS 1's) with poses, as crazyswarm2, motion_capture_tracking and vicon_bridge record them."""
+"""Read poses from ROS 1 and ROS 2 bags, as recorded from crazyswarm2, motion_capture_tracking and vicon_bridge."""
 
 import re
 from collections import defaultdict
@@ -14,7 +14,7 @@ FORMAT, EXTRA = "ROS bag", "ros"
 _SUFFIXES = {b"\x89MCAP0\r\n": ".mcap", b"SQLite format 3\0": ".db3", b"#ROSBAG V": ".bag"}  # by a file's first bytes
 HEAD = re.compile(b"|".join(map(re.escape, _SUFFIXES)))
 _CHANNELS = ("t", *PLACE, *QUATERNION)
-_POSE, _COVARIANT_POSE, _TRANSFORM = (  # the fields of these channels but the time
+_POSE, _COVARIANT_POSE, _TRANSFORM = (  # the fields of these channels except the time
     attrgetter(*(f"{place}.{axis}" for axis in "xyz"), *(f"{turn}.{axis}" for axis in "xyzw"))
     for place, turn in (
         ("pose.position", "pose.orientation"),
@@ -33,9 +33,9 @@ _TYPES = {  # the field with its poses if it holds several, the field with a pos
 
 
 def read(file: Path) -> MocapLog:
-    """Read every pose by its topic, or by its name where a message holds several; times are of the messages' headers.
+    """Read every pose, named by its topic, or by its own name if a message holds several; times are from headers.
 
-    Raises InputError where the bag is damaged, or no message in it holds a pose; ImportError without the extra.
+    Raises InputError if the bag is damaged or no message in it holds a pose; ImportError without the extra.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
@@ -63,7 +63,7 @@ def read(file: Path) -> MocapLog:
                     rows[name or connection.topic].append((time, *pose(item)))
     except InputError:
         raise
-    # on damaged bytes the readers raise what their parts raise: struct, sqlite, lz4, zstd, yaml, keys
+    # for damaged bytes the readers raise errors of their parts: struct, sqlite, lz4, zstd, yaml, keys
     except Exception as error:
         raise InputError(
             f"the bag cannot be read ({type(error).__name__}: {' '.join(str(error).split())[:160]})",

@@ -1,7 +1,7 @@
 """Read MAVLink .tlog: a ground station's packets, each after its time (8 bytes, big endian, µs since 1970).
 
-Positions in MAVLink are north, east, down and bodies forward, right, down; ours are z up and forward, left, up, with x
-east and y north (LOCAL_NED), or x forward (LOCAL_FRD).
+MAVLink's world axes are north, east, down, its body axes forward, right, down. Here the world's z is up, with x east
+and y north (LOCAL_NED) or x forward (LOCAL_FRD), and body axes are forward, left, up.
 """
 
 import re
@@ -46,10 +46,10 @@ _MESSAGES: dict[int, tuple[tuple[str, ...], Callable[[Any], Any]]] = {  # messag
     _ODOMETRY: ((*PLACE, "frame", *QUATERNION), lambda m: (m.x, m.y, m.z, m.frame_id, *m.q[1:], m.q[0])),
     _SETPOINT: ((*PLACE, "frame"), attrgetter("x", "y", "z", "coordinate_frame")),
 }
-_SUBJECTS = {_ODOMETRY: " odometry", _LOCAL_POSITION: "", _SETPOINT: " setpoint"}  # message: what follows the name
-_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse; x and y change places, z turns over
+_SUBJECTS = {_ODOMETRY: " odometry", _LOCAL_POSITION: "", _SETPOINT: " setpoint"}  # suffix of the name, by message
+_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])  # its own inverse: swaps x and y, and flips z
 _FRD = Rotation.from_matrix([[1, 0, 0], [0, -1, 0], [0, 0, -1]])
-_LONGEST_GAP = 0.5  # s between attitudes; over longer ones none is made up
+_LONGEST_GAP = 0.5  # s between attitudes; longer gaps are not interpolated
 
 
 def read(file: Path) -> MocapLog:
@@ -73,7 +73,7 @@ def read(file: Path) -> MocapLog:
         kind = message.get_msgId()
         rows[message.get_srcSystem(), kind].append((time, *_MESSAGES[kind][1](message)))
     if broken:
-        notes.append(f"{broken} packets left out, as their checksums are wrong")
+        notes.append(f"{broken} packets left out because of wrong checksums")
     if truncated:
         notes.append("the last packet is cut off and left out")
     start = min((listed[0][0] for listed in rows.values()), default=0.0)
@@ -100,12 +100,12 @@ def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], 
     cut = place > len(data) or HEAD.match(data, place) is not None
     skipped += 0 if cut else len(data) - place
     if skipped:
-        notes.append(f"{skipped} bytes skipped that are no packet")
+        notes.append(f"{skipped} bytes skipped that are not packets")
     return packets, cut
 
 
 def _subjects(name: str, tables: dict[int, Table]) -> Iterator[LoggedSubject]:
-    """Yield what one vehicle's messages say, in our axes."""
+    """Yield the subjects in one vehicle's messages, in cfplan's axes."""
     for kind, suffix in _SUBJECTS.items():
         if kind not in tables:
             continue
@@ -122,7 +122,7 @@ def _turned(world: Rotation, reported: NDArray) -> Rotation:
 
 
 def _attitude_at(time: NDArray, tables: dict[int, Table]) -> NDArray:
-    """Return (N, 4) the attitude at each time, NaN where none was reported nearby."""
+    """Return the attitude at each time, (N, 4), NaN where none was reported nearby."""
     found = np.full((len(time), 4), np.nan)
     table = tables.get(_ATTITUDE_QUATERNION, tables.get(_ATTITUDE))
     if table is None:

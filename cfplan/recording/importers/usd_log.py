@@ -2,8 +2,8 @@
 
 u8 0xBC, u16 version, u16 event types
 each type: u16 number, name\\0, u16 variables, each `group.name(T)\\0` with T the struct code of its type
-records: u16 type, time (version 2: u64 µs, version 1: u32 ms), the values one behind the other
-u32 CRC-32 of everything before; missing where the vehicle lost power while it wrote
+records: u16 type, time (version 2: u64 µs, version 1: u32 ms), the values in order
+u32 CRC-32 of everything before; missing if the vehicle lost power while writing
 """
 
 import math
@@ -32,7 +32,7 @@ def _of_group(group: str, columns: Columns) -> Columns:
     return {channel: (f"{group}.{name}", unit) for channel, (name, unit) in columns.items()}
 
 
-SOURCES = {  # subject: the variables that make its pose
+SOURCES = {  # subject: the variables of its pose
     "mocap": _of_group("locSrv", POSE),
     "estimate": _of_group("stateEstimate", {**POSE, **_ANGLES}),
     "estimate, compressed": _of_group("stateEstimateZ", {axis: (axis, 1e-3) for axis in PLACE}),
@@ -43,10 +43,10 @@ SOURCES = {  # subject: the variables that make its pose
 
 
 def read(file: Path) -> MocapLog:
-    """Read every pose that was logged: motion capture, estimate, setpoint. Times count from the first record.
+    """Read every logged pose: motion capture, estimate, setpoint. Times count from the first record.
 
-    Without its checksum the log was cut off: all complete records are read, and `truncated` says so.
-    Raises InputError where the checksum is wrong, the head is damaged, or no variables of a pose were logged.
+    A log without its checksum was cut off: all complete records are read, and `truncated` is True.
+    Raises InputError if the checksum is wrong, the head is damaged, or no variables of a pose were logged.
     """
     data = file.read_bytes()
     unit, types, begin = _head(data, file)
@@ -86,7 +86,7 @@ def read(file: Path) -> MocapLog:
 
 
 def _head(data: bytes, file: Path) -> tuple[float, dict[int, tuple[str, np.dtype]], int]:
-    """Return the unit of times in s, name and row of each type, and where the records begin."""
+    """Return the unit of times in s, name and row dtype of each event type, and the offset of the first record."""
     offset = 1
 
     def number(most: int = 0xFFFF) -> int:
@@ -121,7 +121,7 @@ def _head(data: bytes, file: Path) -> tuple[float, dict[int, tuple[str, np.dtype
 
 
 def _is_truncated(data: bytes, end: int, within_record: bool, file: Path) -> bool:
-    """Return whether the log was cut off after its records. Raises InputError where it is complete but damaged."""
+    """Return whether the log was cut off after its records. Raises InputError if it is complete but damaged."""
     rest = data[end:]
     if len(rest) == 4 and zlib.crc32(memoryview(data)[:end]) == int.from_bytes(rest, "little"):
         return False

@@ -1,4 +1,4 @@
-"""Read Vicon Tracker's and Nexus's CSV: sections of frames at a fixed rate, a subject every few columns."""
+"""Read the CSV of Vicon Tracker and Nexus: sections of frames at a fixed rate, a few columns per subject."""
 
 import re
 from itertools import pairwise
@@ -13,23 +13,23 @@ from cfplan.recording.importers.vicon_header import Group, Rotations, Section, r
 
 FORMAT = "Vicon CSV"
 LARGEST_ROOM = 100.0  # m from the origin; beyond it the unit is wrong
-_MARK = b"\xef\xbb\xbf"  # of the byte order, as some programs write it first
+_MARK = b"\xef\xbb\xbf"  # byte order mark, which some programs write first
 HEAD = re.compile(  # a section's name and its rate, or in some line the columns Frame and Sub Frame
     rb"(?:\xef\xbb\xbf)?(?:[\s,;\"]*[A-Za-z][\w ]*\"?[,;\t ]*\r?\n\"?[\d.,]+\"?[,;\t ]*\r?\n"
     rb"|(?s:.*\n|)(?i:\"?frame\"?[,;\t]\"?sub ?frame))"
 )
 _BLANK = re.compile(rb"\n[ \t,;\r]+(?=\n|\Z)")
 _LEADING = re.compile(rb"[\s,;]*")
-_SECTION = re.compile(rb"\n\n+(?=[^\n\d\"-])")  # what begins with a number goes on with the frames before
+_SECTION = re.compile(rb"\n\n+(?=[^\n\d\"-])")  # a line that begins with a number continues the frames before
 _FIVE_LINES = re.compile(rb"(?:[^\n]*\n?){5}")
 
 
 def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     """Read every subject of every section; markers too, as positions without orientation.
 
-    `rotations` says what three angles are where the header does not; the default is helical.
+    `rotations` is the kind of three angles if the header does not say; the default is helical.
 
-    Raises InputError where a head, a unit or a number is wrong; a last line that is cut off only ends the log.
+    Raises InputError if a head, a unit or a number is wrong; a last line that is cut off only ends the log.
     """
     data = _BLANK.sub(b"\n", file.read_bytes().removeprefix(_MARK))
     subjects: dict[str, LoggedSubject] = {}
@@ -54,12 +54,12 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
         if origin is None:
             origin = next(iter(frame[np.isfinite(frame)]), None)
         part = np.nan_to_num(sub_frame[0]) if sub_frame else np.zeros(len(frame))
-        with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers do not grow, or make times that none has
+        with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers do not increase, or overflow
             time = ((frame - (origin or 0.0)) * (1 + part.max(initial=0.0)) + part) / section.rate
         table = in_order({**table, "t": time}, f"frames of section {section.name}", notes)
         for group in section.groups:
             if group.name in subjects:
-                notes.append(f"{group.name} stands in the file twice; the first is used")
+                notes.append(f"{group.name} occurs twice in the file; the first is used")
             else:
                 subjects[group.name] = _subject(group, table, str(file))
     if len(rates) > 1:
@@ -83,8 +83,8 @@ def _frames(data: bytes, begin: int, end: int, section: Section, where: str) -> 
 
 
 def _subject(group: Group, table: Table, where: str) -> LoggedSubject:
-    """Return one subject's poses; a row of zeros alone is an occlusion, as some exports write it."""
-    values = np.stack([table[column] for column, _ in group.columns.values()])  # the place first
+    """Return one subject's poses; a row of zeros is an occlusion, as some exports write it."""
+    values = np.stack([table[column] for column, _ in group.columns.values()])  # the position first
     values[:, np.isnan(values[:3]).any(axis=0) | (values == 0).all(axis=0)] = np.nan
     seen = dict(zip((column for column, _ in group.columns.values()), values, strict=True))
     found = subject(group.name, {"t": table["t"], **seen}, group.columns, where=where)

@@ -32,7 +32,7 @@ LENGTHS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 ANGLES = {"rad": 1.0, "deg": math.pi / 180}
 _TRANSLATION = (PLACE, ("TX", "TY", "TZ"), LENGTHS)
 COLUMNS: dict[Rotations, tuple[tuple[tuple[str, ...], tuple[str, ...], dict[str, float]], ...]] = {
-    # kind: channels, their columns and units; the place first
+    # kind: channels, their columns and units; the position first
     Rotations.QUATERNION: (_TRANSLATION, (QUATERNION, ("RX", "RY", "RZ", "RW"), {})),
     Rotations.HELICAL: (_TRANSLATION, (ROTATION_VECTOR, ("RX", "RY", "RZ"), ANGLES)),
     Rotations.EULER: (_TRANSLATION, (EULER_XYZ, ("RX", "RY", "RZ"), ANGLES)),
@@ -48,13 +48,13 @@ class Group:
     """The columns of one subject."""
 
     name: str
-    columns: dict[str, tuple[int, float]]  # of each channel, those of the place first: its column, and its unit in SI
+    columns: dict[str, tuple[int, float]]  # channel, position first: its column, and the factor to SI units
     assumed: bool  # the header does not say what its angles are
 
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One head, read."""
+    """The content of one section's head."""
 
     name: str
     rate: float  # Hz, of the rows
@@ -65,7 +65,7 @@ class Section:
 
 
 def read_head(lines: list[str], *, where: str, rotations: Rotations | None) -> Section:
-    """Read the five lines of a head. Raises InputError where a line is malformed."""
+    """Read the five lines of a head. Raises InputError if a line is malformed."""
     name = _first_cell(lines[0])
     rate = _rate(lines[1] if len(lines) > 1 else "", name, where)
     if len(lines) < 4:
@@ -119,7 +119,7 @@ def _rate(line: str, section: str, where: str) -> float:
 def _group(
     title: str, headings: dict[str, int], units: list[str], where: str, rotations: Rotations | None
 ) -> Group | None:
-    """Return the subject under a title; None where it is no pose. Raises InputError where columns are missing."""
+    """Return the subject under a title, or None if it is not a pose. Raises InputError if columns are missing."""
     match = _NAME.match(title)
     frame, word, name = (match[key] or "" for key in ("frame", "word", "name")) if match else ("", "", title)
     parent, _, segment = name.strip().partition(":")
@@ -147,7 +147,7 @@ def _group(
 
 
 def _unit(units: list[str], known: dict[str, float], name: str, where: str) -> float:
-    """Return the factor to SI, 1 where no unit is known. Raises InputError unless all columns have one known unit."""
+    """Return the factor to SI, 1 if no unit is known. Raises InputError unless all columns have one known unit."""
     found = sorted({unit.lower().strip("()[] ") for unit in units})
     if not known or (len(found) == 1 and found[0] in known):
         return known.get(found[0], 1.0)

@@ -1,3 +1,3 @@
-"""The report: a page with a flight's figures and charts."""
+"""The report: a page with the figures and charts of flights."""
 
 __all__ = ["page", "report"]

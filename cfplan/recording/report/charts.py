@@ -1,6 +1,6 @@
-"""Draw charts with matplotlib: lines over time with their limits, and places seen from above or from a side.
+"""Draw charts with matplotlib: lines over time with their limits, and positions seen from above or from a side.
 
-Each is a figure of the page: its title and legend are HTML, in which any name can stand, and what is drawn is SVG.
+Each is a figure of the page: the drawing is SVG; title and legend are HTML, which can show any name.
 """
 
 import html
@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from cfplan.planning.active_limits import on_white
 from cfplan.recording.plots import LIMIT, Colour, near_limits
 
-WIDTH, HEIGHT = 496.0, 170.0  # points, of what is drawn
+WIDTH, HEIGHT = 496.0, 170.0  # points, of the area inside the axes
 LEFT, RIGHT, TOP, BOTTOM = 52.0, 12.0, 8.0, 34.0  # points around it
-LOWEST, TALLEST = 60.0, 320.0  # points, of a chart of places
-NARROWEST = 1.0  # m across a chart of places, or millimetres of noise would fill it
+LOWEST, TALLEST = 60.0, 320.0  # points, height of a chart of positions
+NARROWEST = 1.0  # m, least width of a chart of positions, so that millimetres of noise do not fill it
 _BAND, _GRID, _TEXT = "#f3f6fb", "#e3e3e3", "#444"
 _STYLE: dict[Any, Any] = {
     "axes.axisbelow": True, "axes.grid": True, "axes.labelcolor": _TEXT, "axes.xmargin": 0.0, "grid.color": _GRID,
@@ -54,10 +54,10 @@ def time_chart(
     band: tuple[float, float] | None = None,
     span: tuple[float, float] | None = None,
 ) -> str:
-    """Draw curves over time in s, the limits as level lines, the band (the time along the path) shaded.
+    """Draw curves over time in s, limits as horizontal lines, and the time along the path as a shaded band.
 
-    The axis shows the times in `span`, or those that there are. A limit far above all measured values is named, not
-    drawn, or nothing else could be seen.
+    The axis shows the times in `span`, or all. A limit far above all measured values is only named in the legend, as
+    drawing it would flatten the curves.
     """
     figure, axes = _axes(curves, HEIGHT)
     values = [curve.y for curve in curves]
@@ -76,7 +76,7 @@ def time_chart(
 
 @mpl.rc_context(_STYLE)
 def place_chart(title: str, curves: Sequence[Curve], names: tuple[str, str]) -> str:
-    """Draw curves in m over m, both axes to the same scale."""
+    """Draw curves in m over m, with the same scale on both axes."""
     ranges = np.array([_range([curve.x for curve in curves]), _range([curve.y for curve in curves])])
     wide, high = np.maximum(1.1 * np.ptp(ranges, axis=1), (NARROWEST, 0.0))
     tall = float(np.clip(high / wide * WIDTH, LOWEST, TALLEST))

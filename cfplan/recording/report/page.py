@@ -38,7 +38,7 @@ figcaption i { display: inline-block; width: 14px; margin-right: .4em; vertical-
 
 
 def page(flights: Sequence[ReportedFlight]) -> str:
-    """Return the whole page; several flights are compared first."""
+    """Return the HTML of the page; several flights are compared first."""
     title = flights[0].record.header.name if len(flights) == 1 else f"{len(flights)} flights"
     parts = [f"<h1>{html.escape(title)}</h1>", _summary(flights)]
     if len(flights) > 1:
@@ -55,13 +55,13 @@ def page(flights: Sequence[ReportedFlight]) -> str:
 
 
 def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
-    """Write the page; whole or not at all. Raises InputError where the file cannot be."""
+    """Write the page atomically. Raises InputError if the file cannot be written."""
     check_new_file(file, overwrite=overwrite)
     write_whole(file, page(flights).encode())
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:
-    """Return what flew, and the numbers: a row each, and a column for each flight; of one flight side by side."""
+    """Return the tables of head and numbers, one column per flight; side by side for one flight."""
     if len(flights) == 1:
         return f'<div class="heads">{_columns(flights, head)}{_columns(flights, rows)}</div>'
     return _columns(flights, lambda flight: [*head(flight), *rows(flight)])
@@ -76,7 +76,7 @@ def _columns(flights: Sequence[ReportedFlight], rows_of: Callable[[ReportedFligh
 def _table(
     kind: str, rows: Iterable[Sequence[str]], *, heads: Sequence[str] = (), marks: Iterable[str] = repeat("")
 ) -> str:
-    """Return a table of a class; `marks` are the classes of its rows."""
+    """Return an HTML table of class `kind`; `marks` are the classes of its rows."""
 
     def line(cells: Sequence[str], tag: str, mark: str = "") -> str:
         body = "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells)
@@ -104,14 +104,14 @@ def _comparison(flights: Sequence[ReportedFlight]) -> str:
 
 
 def _along(trial: Trial) -> np.ndarray:
-    """Return the rows while the path was flown; all where there was none."""
+    """Return the rows of the time along the path; all rows if it was not flown."""
     if trial.reference is None or len(trial.reference.time) == 0:
         return np.arange(len(trial.time))
     return np.flatnonzero((trial.time >= 0) & (trial.time <= trial.reference.time[-1]))
 
 
 def _views(trials: Sequence[Trial]) -> list[str]:
-    """Draw the room from above, and beside it from two sides."""
+    """Draw the flights from above, and beside that from two sides."""
     sides = "".join(_places(trials, name, across, up) for name, across, up in _SIDES)
     return [_places(trials, "From above", 0, 1), f"<div>{sides}</div>"]
 
@@ -123,7 +123,7 @@ def _places(trials: Sequence[Trial], title: str, across: int, up: int) -> str:
         along_rows = _along(trial)
         label = short_name(trial.name) if len(trials) > 1 else "flown"
         curves.append(Curve(label, trial.position[along_rows, across], trial.position[along_rows, up], colour))
-    curves += [  # last, or the flown lines would cover its dashes
+    curves += [  # last, so that the flown lines do not cover its dashes
         Curve(f"{reference.name} (reference)", reference.position[:, across], reference.position[:, up], _PATH, True)
         for reference in references(trials)
     ]
@@ -172,9 +172,9 @@ def _events(flight: ReportedFlight) -> str:
         return "<h3>Events</h3><p>None were recorded.</p>"
     entries.sort(key=lambda entry: entry[0])
     grave = [entry for entry in entries if entry[1] in (Level.WARNING, Level.ERROR)]
-    told = _event_table(record, grave) if grave else "<p>No warnings and no errors.</p>"
+    shown = _event_table(record, grave) if grave else "<p>No warnings and no errors.</p>"
     return (
-        f"<h3>Events</h3>{told}<details><summary>All {len(entries)} events and phases</summary>"
+        f"<h3>Events</h3>{shown}<details><summary>All {len(entries)} events and phases</summary>"
         f"{_event_table(record, entries)}</details>"
     )
 
@@ -196,4 +196,4 @@ def _certificate(flight: ReportedFlight) -> str:
 
 
 def _provenance(flight: ReportedFlight) -> str:
-    return f"<h3>Where it comes from</h3>{_table('provenance', flight.provenance)}"
+    return f"<h3>Provenance</h3>{_table('provenance', flight.provenance)}"

@@ -1,4 +1,4 @@
-"""Gather what is reported of a flight: its numbers, its certificate, its events, its provenance."""
+"""Gather the data of a flight's report: its numbers, certificate, events and provenance."""
 
 import math
 from collections.abc import Mapping
@@ -21,17 +21,17 @@ class ReportedFlight:
     name: str  # of its folder
     record: Record
     summary: FlightSummary
-    shares: Mapping[str, float]  # of the plan's limit, of each peak; NaN where there is no such limit
-    certificate: Certificate | None  # of its plan; None where the record has none that can be read
+    shares: Mapping[str, float]  # usage of the plan's limit by each peak; NaN without such a limit
+    certificate: Certificate | None  # of its plan; None if the record has no readable plan
     provenance: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...]  # what is missing, one sentence each
+    notes: tuple[str, ...]  # missing data, one sentence each
 
 
 def read_flight(place: Path) -> ReportedFlight:
-    """Read a record, with the plan that lies beside it. Raises InputError where it is no record."""
+    """Read a record, with the plan beside it. Raises InputError if it is not a record."""
     record = read_record(place)
     summary = summarise(record)
-    notes = ["The record ends early: what follows its last whole chunk is lost."] if record.truncated else []
+    notes = ["The record ends early: data after its last complete chunk is lost."] if record.truncated else []
     certificate, plan_rows = None, []
     plan_file = record.folder / PLAN_FILE
     if plan_file.is_file():
@@ -74,13 +74,13 @@ def _provenance(record: Record) -> list[tuple[str, str]]:
 
 
 def outcome(flight: ReportedFlight) -> str:
-    """Return how it ended, in the pilot's words."""
+    """Return how the flight ended, in the pilot's words."""
     ended = flight.record.summary.get("outcome")
     return str(ended.get("reason") or UNKNOWN) if isinstance(ended, Mapping) else UNKNOWN
 
 
 def head(flight: ReportedFlight) -> list[tuple[str, str]]:
-    """Return what flew, where, when and by what, for the head of the page."""
+    """Return vehicle, room, time, link and planner, for the head of the page."""
     header = flight.record.header
     low, high = header.fence
     sides = " × ".join(f"{b - a:g}" for a, b in zip(low, high, strict=True))
@@ -96,7 +96,7 @@ def head(flight: ReportedFlight) -> list[tuple[str, str]]:
 
 
 def rows(flight: ReportedFlight) -> list[tuple[str, str]]:
-    """Return the summary table: what each number is, and its value as people read it."""
+    """Return the summary table: the name of each number, and its value as text."""
     return [
         *summary_rows(flight.summary, flight.record.header.plan_limits),
         ("certificate", _verdict(flight.certificate)),
@@ -112,7 +112,7 @@ def _verdict(certificate: Certificate | None) -> str:
 
 
 def flight_to_dict(flight: ReportedFlight) -> dict[str, Any]:
-    """Return the report for JSON: all numbers in SI."""
+    """Return the report for JSON, with all numbers in SI units."""
     record = flight.record
     events = zip(record.events.time - record.start, record.events.level, record.events.text, strict=True)
     return {

@@ -139,7 +139,7 @@ def test_sections_of_other_rates_have_times_of_their_own_and_forces_are_left_out
         (lambda head, rows: [*head, *rows[:10], *rows[20:]], [*range(10), *range(20, 40)], []),
         (lambda head, rows: [*head, *rows, *rows[5:7]], range(40), ["2 frames of section Objects left out"]),
         (lambda head, rows: [*head, *rows[:15], "\n", *rows[15:]], range(40), []),
-        (lambda head, rows: [*head, *rows, "\n", *head, *rows], range(40), ["cf1 stands in the file twice"]),
+        (lambda head, rows: [*head, *rows, "\n", *head, *rows], range(40), ["cf1 occurs twice in the file"]),
         (lambda head, rows: [*head, *rows[:30], rows[30][:40]], range(30), ["the last line is cut off"]),
     ],
     ids=["gap", "back", "blank line", "twice", "cut off"],

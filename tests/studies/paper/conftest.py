@@ -1,4 +1,4 @@
-"""Networks work on one thread, as in the studies' own processes."""
+"""Limit networks to one thread, as in the studies' own processes."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""All tables of the paper: results of the present sources and settings are kept, others are made anew."""
+"""All tables of the paper: results of the present sources and settings are kept, others are measured again."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ CHEAP = {"yaw-consistency": {"pairs": 1, "seed": 50_003}}
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """The folder of one result."""
+    """Return the folder of one result."""
     folder = tmp_path_factory.mktemp("results")
     (first,) = paper_results(folder, quick=True, studies=CHEAP)
     assert not first.kept

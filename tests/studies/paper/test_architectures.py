@@ -1,4 +1,4 @@
-"""The paper's tables of planners: what is counted, what stands beside it, and quick runs."""
+"""The paper's tables of planners: their counts, the paper's numbers, and quick runs."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The paper's Table 3: every planner on the same paths, with what the paper prints beside."""
+"""The paper's Table 3: every planner on the same paths, beside the paper's numbers."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_all_but_those_that_allot_times_keep_to_the_path(quick):
     assert trials[SHIPPED].deviation < 0.05
     assert trials[SHIPPED].violation == 0.0
     assert trials[MIN_SNAP].travel_time > 1.2 * trials[SHIPPED].travel_time
-    assert trials[BAYESIAN].travel_time <= 1.001 * trials[MIN_SNAP].travel_time  # it begins with uniform timings
+    assert trials[BAYESIAN].travel_time <= 1.001 * trials[MIN_SNAP].travel_time  # the search begins with uniform ones
     assert trials[BAYESIAN].deviation < 0.05
     assert trials["expert"].travel_time == pytest.approx(trials[SHIPPED].travel_time, rel=0.005)
 

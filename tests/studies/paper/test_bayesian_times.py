@@ -1,4 +1,4 @@
-"""Segment times by Bayesian optimisation: they pass the dear check, and come near an optimum that is known."""
+"""Segment times by Bayesian optimisation: they pass the expensive check, and come close to a known optimum."""
 
 import sys
 
@@ -13,12 +13,12 @@ SMALL = Budget(low=80, high=10, iterations=15, more_low=10)
 
 
 def slower_than(least):
-    """A check that passes what takes at least so long on each segment: the optimum is that itself."""
+    """Return a check that passes times of at least `least` on each segment, which is therefore the optimum."""
     return lambda times: bool((times >= least).all())
 
 
 def test_times_near_the_optimum_are_found_where_uniform_ones_are_far_from_it():
-    least = np.array([2.0, 2.0])  # of uniform timings (2, 4) is the fastest
+    least = np.array([2.0, 2.0])  # the fastest uniform timing is (2, 4)
     found = optimise_times(NOMINAL, slower_than(least), slower_than(least), budget=SMALL)
     assert found.uniform == pytest.approx(6.0, rel=1e-3)
     assert (found.times >= least).all()
@@ -47,7 +47,7 @@ def test_checks_are_asked_within_the_budget_and_as_often_as_is_said():
         NOMINAL, counted("low", slower_than(least)), counted("high", slower_than(least)), budget=SMALL
     )
     assert (found.asked_low, found.asked_high) == (asked["low"], asked["high"])
-    assert found.asked_high <= SMALL.high + SMALL.iterations + 26  # the rest looks for the fastest uniform timing
+    assert found.asked_high <= SMALL.high + SMALL.iterations + 26  # the others find the fastest uniform timing
 
 
 def test_the_same_seed_finds_the_same_times():

@@ -1,4 +1,4 @@
-"""The classifier of Bayesian optimisation, against scikit-learn's, which begins anew each time."""
+"""The classifier of Bayesian optimisation, against scikit-learn's, which has no warm start."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Minimum-jerk motion through boxes: the known answer where no wall is near, and within the walls where they are."""
+"""Minimum-jerk motion through boxes: the analytical solution far from walls, and motions within near ones."""
 
 import numpy as np
 import pytest

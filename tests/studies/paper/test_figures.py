@@ -1,4 +1,4 @@
-"""The paper's figures: drawn from results, with all that the paper's show."""
+"""The paper's figures, drawn from results, with everything that the originals show."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ PAIRS = [Pair(way, 50_000, "", 8.0, 1.0, 0.1, 0.2, 0.3) for way in WAYS]
 
 
 def flights():
-    """Flights over two paths and the long one; of LSTM-0.01 over the second, a crash and a loss as planned."""
+    """Return flights over two paths and the long one; as planned, LSTM-0.01 crashes and is lost over the second."""
     over = {RAW: [[0, 0, 0], [900, 880, 0]], CERTIFIED: [[0, 0, 500], [900, 890, 500]]}
     made = [
         HardwareFlight(TRACKED, way, planner, path, trial, deviation=0.1, points=over[way])

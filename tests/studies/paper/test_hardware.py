@@ -1,4 +1,4 @@
-"""The paper's hardware tables on the virtual lab: what is flown, under which limits, and who crashes."""
+"""The paper's hardware tables in the stepped lab: plans, limits and crashes."""
 
 import numpy as np
 import pytest
@@ -81,7 +81,7 @@ def test_failures_are_counted_and_left_out_of_the_means():
     assert row["paper_time"] == 8.288
     assert [each["flights"] for each in line.rows] == [1]  # the first path alone
     assert not long.rows
-    assert all("paper_time" not in row for row in line.rows)  # the paper's are of all paths
+    assert all("paper_time" not in row for row in line.rows)  # the paper's times are means over all paths
 
 
 @pytest.mark.parametrize("name", LIMITS)

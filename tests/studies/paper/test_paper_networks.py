@@ -1,4 +1,4 @@
-"""The paper's networks: what they are fed, what they cannot know, and that training goes on where it stopped."""
+"""The paper's networks: inputs, teacher forcing and causality, and training that resumes after a stop."""
 
 from dataclasses import replace
 

@@ -37,7 +37,7 @@ def test_what_is_certified_is_followed_and_changes_with_its_path(quick):
     assert changes[1] < changes[2] < changes[3]
 
 
-def test_how_answers_vary_is_told_of_each_scale_and_yaw_that_is_held_does_not(quick):
+def test_the_variation_of_answers_is_shown_for_each_scale_and_is_zero_for_fixed_yaw(quick):
     rows = {(row["model"], row["epsilon"]): row for row in quick.table("variation").rows}
     assert len(rows) == 3 * len(SCALES[1:])
     trials = quick.rows

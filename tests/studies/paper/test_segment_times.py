@@ -1,4 +1,4 @@
-"""MFBOTrajectory's kind: what its checks let pass, and what it makes of waypoints."""
+"""Segment times like MFBOTrajectory's: their checks, and the motions through waypoints."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ LENGTHS = np.linalg.norm(np.diff(COURSE.waypoints, axis=0), axis=1)
 
 
 def at(speed):
-    """The min-snap motion whose segments take as long as at this speed, m/s, along straight lines."""
+    """Return the min-snap motion whose segments take as long as straight lines at this speed, m/s."""
     return timed_trajectory(min_snap(COURSE.waypoints, times=LENGTHS / speed))
 
 

@@ -1,4 +1,4 @@
-"""The paper's tables by bodies of other simulators: the same controller, and who counts as lost."""
+"""The paper's tables with bodies of other simulators: the same controller, and lost flights."""
 
 import numpy as np
 import pytest

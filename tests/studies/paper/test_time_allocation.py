@@ -1,4 +1,4 @@
-"""Segment times that are learned from corridors: better than none, and no worse than a guess on unseen ones."""
+"""Segment times learned from corridors: better than equal times, and able to generalise."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def test_a_box_is_seen_the_same_whichever_way_its_axes_point():
 
 
 def straight(seed):
-    """A corridor along a line of 1 to 12 m."""
+    """Return a corridor along a line of 1 to 12 m."""
     random = np.random.default_rng(seed)
     way = random.normal(size=3)
     way *= random.uniform(1.0, 12.0) / np.linalg.norm(way)

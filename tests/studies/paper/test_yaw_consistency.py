@@ -1,4 +1,4 @@
-"""Yaw consistency: pairs of paths, and what differs between their plans."""
+"""Yaw consistency: pairs of paths, and the differences between their plans."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A study's cases: measured by processes or a cluster, onwards from a kill, never mixed with those of other sources."""
+"""A study's cases: measured by processes or a cluster, resumed after a kill, not mixed with those of other sources."""
 
 import json
 import os
@@ -23,13 +23,13 @@ from studies.runner.result import Column, read_result, table
 from studies.runner.study import Study, Work
 
 REPOSITORY = Path(__file__).parents[3]
-MODULE = "studies.runner.study"  # stands for that of a study: it has sources
+MODULE = "studies.runner.study"  # any module with sources can stand in for a study's
 
 
 @dataclass(frozen=True)
 class Settings:
     count: int = option(4, "Numbers.")
-    log: str = option("", "File for a line a number that was squared.")
+    log: str = option("", "File for a line per squared number.")
     stop_at: int = option(-1, "Number at which the user interrupts.")
 
 
@@ -77,13 +77,13 @@ def unfinished(file):
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_rows_come_in_the_order_of_the_cases_and_are_as_they_were(workers):
-    told = []
-    effort = Effort(workers, progress=lambda name: lambda done, total: told.append((name, done, total)))
+    calls = []
+    effort = Effort(workers, progress=lambda name: lambda done, total: calls.append((name, done, total)))
     result = run_study("squares", MODULE, STUDY, Settings(), effort)
     assert [row.value for row in result.rows] == [0.0, 1.0, 4.0, 9.0]
     assert np.isnan(result.rows[1].pair[0])
     assert result.rows[1].pair[1] == np.inf
-    assert [each for each in told if each[0] == "squares"] == [("squares", done, 4) for done in range(5)]
+    assert [each for each in calls if each[0] == "squares"] == [("squares", done, 4) for done in range(5)]
     assert result.table("squares").rows == ({"largest": 9.0},)
     assert not result.interrupted
     assert result.seconds > 0.0
@@ -100,7 +100,7 @@ def test_after_an_interrupt_only_what_was_not_done_is_measured(log, tmp_path):
     assert [row.number for row in stopped.rows] == [0, 1]
     result = run_study("squares", MODULE, STUDY, Settings(log=str(log)), Effort(output=out))
     assert not result.interrupted
-    assert made(log) == [0, 1, 2, 3]  # each once
+    assert made(log) == [0, 1, 2, 3]  # each only once
     assert [row.value for row in result.rows] == [0.0, 1.0, 4.0, 9.0]
 
 
@@ -115,8 +115,8 @@ def test_a_case_that_a_kill_cut_off_as_it_was_written_is_measured_again(log, tmp
 
 @pytest.mark.parametrize("key", ["sources", "settings", "study", "identity", "files", None])
 def test_what_other_sources_or_settings_made_is_set_aside_and_never_mixed_in(log, tmp_path, key):
-    told = []
-    effort = Effort(output=tmp_path / "r.json", say=told.append)
+    messages = []
+    effort = Effort(output=tmp_path / "r.json", say=messages.append)
     run_study("squares", MODULE, STUDY, Settings(log=str(log)), effort)
     file = unfinished(effort.output)
     header, *rest = file.read_text().splitlines()
@@ -126,7 +126,7 @@ def test_what_other_sources_or_settings_made_is_set_aside_and_never_mixed_in(log
     assert made(log) == [0, 0, 1, 1, 2, 2, 3, 3]
     (aside,) = tmp_path.glob("r.json.stale-*")
     assert len(aside.read_text().splitlines()) == 5  # nothing of it is lost
-    assert told[0].startswith(f"{aside}: 4 cases")
+    assert messages[0].startswith(f"{aside}: 4 cases")
 
 
 def test_without_an_output_nothing_is_kept_and_where_nothing_can_be_kept_nothing_is_measured(log, tmp_path):

@@ -1,4 +1,4 @@
-"""`python -m studies`: options follow from settings, an unknown study is answered with those that there are."""
+"""`python -m studies`: options are derived from settings, and an unknown study is answered with the known ones."""
 
 from dataclasses import dataclass
 from pathlib import Path

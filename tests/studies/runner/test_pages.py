@@ -1,4 +1,4 @@
-"""Results on pages: README and docs/ show what results/ holds, and figures of other sources are marked."""
+"""Results on pages: README and docs/ show the contents of results/, and figures of other sources are marked."""
 
 import re
 from dataclasses import replace

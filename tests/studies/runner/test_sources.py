@@ -1,4 +1,4 @@
-"""The digest of a study's sources: it changes with what the study imports, not with words about it."""
+"""The digest of a study's sources: it changes with imported code, not with comments and docstrings."""
 
 import subprocess
 import sys
@@ -20,7 +20,7 @@ def digest_of_copy(folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory):
-    """A copy of all sources, which tests change."""
+    """Return a copy of all sources, which tests change."""
     folder = tmp_path_factory.mktemp("sources")
     names = subprocess.run(["git", "ls-files", "cfplan", "studies", "models", "safety.yaml"], cwd=REPOSITORY,
                            capture_output=True, text=True, check=True).stdout.split()  # fmt: skip
