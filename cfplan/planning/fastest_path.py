@@ -47,13 +47,14 @@ class FastestPath(NamedTuple):
     path: Path
     duration: float  # s, of the certified flight at full speed; infinite where there is none
     min_snap: float  # s, likewise along the better min-snap path, with times like the lengths or centripetal ones
+    finished: bool  # whether the search ended before the deadline
 
     def describe(self, speed_factor: float) -> str:
         """Return what the choice was worth, at a factor of the full speed."""
-        seconds = f"fastest path: {self.duration / speed_factor:.2f} s"
-        if self.min_snap < math.inf:
-            return f"{seconds} instead of {self.min_snap / speed_factor:.2f} s"
-        return f"{seconds}, where min-snap cannot be flown"
+        flown = self.min_snap < math.inf
+        gain = f"instead of {self.min_snap / speed_factor:.2f} s" if flown else "where min-snap cannot be flown"
+        cut = "" if self.finished else ", its search cut short by the budget"
+        return f"fastest path: {self.duration / speed_factor:.2f} s {gain}{cut}"
 
 
 def chosen_path(
@@ -128,18 +129,19 @@ def fastest_path(
     duration = _proposed_duration(task)
     starts = [np.log(lengths[:own]), np.log(centripetal_times(points)[:own])]
     searching = deadline.earlier(CERTIFYING * deadline.left) if deadline.left < math.inf else NEVER
-    paths = [path_with(logs) for logs in (_searched(cost, starts, searching), *starts)]
+    found, finished = _searched(cost, starts, searching)
+    paths = [path_with(logs) for logs in (found, *starts)]
     durations = [certified(path) for path in paths]
     best = int(np.argmin(durations))  # the first of equal ones
-    return FastestPath(paths[best], durations[best], min(durations[1:]))
+    return FastestPath(paths[best], durations[best], min(durations[1:]), finished)
 
 
 class _OutOfTime(Exception):
     """The deadline passed within the search."""
 
 
-def _searched(cost: Callable[[NDArray], float], starts: list[NDArray], deadline: Deadline) -> NDArray:
-    """Return the best of what a search from the best start sees."""
+def _searched(cost: Callable[[NDArray], float], starts: list[NDArray], deadline: Deadline) -> tuple[NDArray, bool]:
+    """Return the best of what a search from the best start sees, and whether it ended before the deadline."""
     from scipy.optimize import minimize  # slow to import
 
     best, least = starts[0], math.inf
@@ -159,7 +161,8 @@ def _searched(cost: Callable[[NDArray], float], starts: list[NDArray], deadline:
             ends = {"xatol": LOG_TOLERANCE, "fatol": TIME_TOLERANCE, "adaptive": True}
             simplex = np.vstack([best, best + FIRST_STEP * np.eye(len(best))])
             minimize(watched, best, method="Nelder-Mead", options=ends | {"initial_simplex": simplex})
-    return best
+        return best, True
+    return best, False
 
 
 def _proposed_duration(task: PlanningTask) -> Callable[[Path], float]:

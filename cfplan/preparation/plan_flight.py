@@ -10,7 +10,7 @@ from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.geometry.path_file import PathFile, PathShape, load_path_file
+from cfplan.geometry.path_file import PathFile, load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
@@ -131,13 +131,13 @@ def plan_flight(
     options = options or FlightOptions()
     with step(on_step, "path") as results:
         path_file = load_path_file(source) if isinstance(source, Path) else source
-        if path_file.path.length > LONG or path_file.shape is PathShape.FASTEST:
-            compile_from_here()
         deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)
         path_file, fastest = chosen_path(path_file, limits, budget=deadline.left, models=options.models)
         check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(path_file.source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
         results += path_file.losses
+    if path_file.path.length > LONG:
+        compile_from_here()
     with step(on_step, "plan") as results:
         planned = plan(
             path_file.path,

@@ -53,6 +53,7 @@ def both_timings(points):
 def test_the_flight_is_shorter_than_along_min_snap_and_within_the_room(name, limits):
     points, below = SETS[name]
     chosen = fastest_path(points, limits.airframe, limits)
+    assert chosen.finished
     check_space(chosen.path, limits.space, waypoints=points)
     np.testing.assert_allclose(chosen.path(chosen.path.breaks), points, atol=1e-9)
     assert np.abs(chosen.path([0.0, chosen.path.end], 1)).max() == 0.0
@@ -76,6 +77,8 @@ def test_whenever_the_deadline_comes_a_certified_path_is_the_answer(questions, l
     ticks = count()
     deadline = Deadline(questions, lambda: float(next(ticks)))
     chosen = fastest_path(LAWN_MOWER, limits.airframe, limits, deadline=deadline)
+    assert not chosen.finished
+    assert "cut short by the budget" in chosen.describe(1.0)
     assert flight(chosen.path, limits) <= 1.001 * min(chosen.duration, chosen.min_snap)
 
 
