@@ -142,8 +142,6 @@ class _OutOfTime(Exception):
 
 def _searched(cost: Callable[[NDArray], float], starts: list[NDArray], deadline: Deadline) -> tuple[NDArray, bool]:
     """Return the best of what a search from the best start sees, and whether it ended before the deadline."""
-    from scipy.optimize import minimize  # slow to import
-
     best, least = starts[0], math.inf
 
     def watched(logs: NDArray) -> float:
@@ -158,6 +156,8 @@ def _searched(cost: Callable[[NDArray], float], starts: list[NDArray], deadline:
         for start in starts:
             watched(start)
         if len(best) > 1 and least < math.inf:
+            from scipy.optimize import minimize  # slow to import
+
             ends = {"xatol": LOG_TOLERANCE, "fatol": TIME_TOLERANCE, "adaptive": True}
             simplex = np.vstack([best, best + FIRST_STEP * np.eye(len(best))])
             minimize(watched, best, method="Nelder-Mead", options=ends | {"initial_simplex": simplex})
