@@ -24,6 +24,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import load_path_file
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
+from cfplan.planning.fastest_path import chosen_path
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import give_way
@@ -95,7 +96,7 @@ COLUMNS = (
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path: its table row, name, path and yaw. Raises what reading a path file raises."""
     limits = limits_for(settings.path_files[0])
-    files = [load_path_file(file) for file in settings.path_files]
+    files = [chosen_path(load_path_file(file), limits)[0] for file in settings.path_files]
     cases = [(each.name, each.name, each.path, each.yaw, each.yaw_angle) for each in files]
     for seed, path in random_paths(limits, settings.seed, settings.random):
         cases.append((RANDOM, f"random {seed}", path, YawMode.FIXED, 0.0))

@@ -33,6 +33,7 @@ def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tupl
     limits = options.read_limits(safety_file, path_files[0], steps, compile_to=Stage.PLAN)
     with steps.waiting("loading planners"):
         from cfplan.geometry.path_file import load_path_file
+        from cfplan.planning.fastest_path import chosen_path
         from cfplan.planning.planners import PLANNERS, find_planner
 
     for name in planners:
@@ -41,6 +42,7 @@ def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tupl
     rows = []
     for path in paths:
         with steps.step(path.name) as results:
+            path, _ = chosen_path(path, limits)
             own = [_row(path, name, limits) for name in planners or PLANNERS]
             fastest = min((row["duration"] for row in own if row["duration"]), default=None)
             results.append("refused by all" if fastest is None else f"{fastest:.3f} s at best")

@@ -52,16 +52,18 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 def _without_walls(source: Path, limits: "Limits", steps: "Steps") -> "Plan":
     """Plan a path file within the limits of motion alone. Raises InfeasibleError if no profile keeps them."""
     from cfplan.geometry.path_file import load_path_file
+    from cfplan.planning.fastest_path import chosen_path
     from cfplan.planning.plan import plan
 
     everywhere = replace(limits.space, low=(-FAR, -FAR, -FAR), high=(FAR, FAR, FAR))
     for_ever = replace(limits.battery, endurance=math.inf)
+    limits = replace(limits, space=everywhere, battery=for_ever)
     with steps.step("plan") as results:
-        path_file = load_path_file(source)
+        path_file, _ = chosen_path(load_path_file(source), limits)
         planned = plan(
             path_file.path,
             limits.airframe,
-            replace(limits, space=everywhere, battery=for_ever),
+            limits,
             yaw=path_file.yaw,
             yaw_angle=path_file.yaw_angle,
             speed_factor=path_file.speed,

@@ -4,6 +4,7 @@ name: figure eight
 waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
                                         # or  samples: file.csv  (t, x, y, z a row; the way is kept, the timing not)
+shape: fastest                          # of waypoints: segment times are chosen when planning; min-snap if left out
 yaw: {mode: fixed, angle_deg: 30}       # or  yaw: tangent,  yaw: free;  fixed at 0 if left out
 laps: 3                                 # of a closed path, flown through without a stop
 speed: 0.5                              # speed factor: 1 is as fast as the limits allow
@@ -14,6 +15,7 @@ import math
 import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Annotated, Any
 
 import numpy as np
@@ -35,12 +37,19 @@ _MAX_POINTS = 50_000  # over all laps
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
 
+class PathShape(StrEnum):
+    """Which curve leads through waypoints."""
+
+    MIN_SNAP = "min-snap"  # with segment times like the straight lengths
+    FASTEST = "fastest"  # with segment times chosen for the shortest flight, see planning/fastest_path.py
+
+
 @dataclass(frozen=True, slots=True)
 class PathFile:
     """A path file's content, checked and placed in the room."""
 
     name: str
-    path: Path  # in the frame of the room
+    path: Path  # in the frame of the room; of min-snap shape until planning chooses another
     yaw: YawMode
     yaw_angle: float  # rad, in the frame of the room, in mode fixed; otherwise 0
     speed: float  # speed factor in (0, 1]; 1 is not slowed
@@ -48,6 +57,7 @@ class PathFile:
     waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
     losses: tuple[str, ...] = ()  # what the path does not keep of what was given, a few words each
+    shape: PathShape = PathShape.MIN_SNAP
 
 
 class _Yaw(BaseModel):
@@ -89,6 +99,7 @@ class _Content(BaseModel):
     points: str | None = None
     polynomials: str | None = None
     samples: str | None = None
+    shape: PathShape = PathShape.MIN_SNAP
     yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
     laps: int = Field(default=1, ge=1, le=1000)
     speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
@@ -104,6 +115,12 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content)
     given = _source(content, places)
+    if "shape" in content.model_fields_set and given != "waypoints":
+        raise InputError(
+            f"shape is for waypoints only: the curve of {given} is kept as it is given",
+            where=places.where_key("shape"),
+            hint="leave shape out, or list waypoints",
+        )
     path, waypoints, *losses = _SOURCES[given](content, places)
     path.check(where=places.where(given))
 
@@ -127,6 +144,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         waypoints=waypoints @ rotation_about_z(turn).T + offset,
         source=file,
         losses=tuple(losses),
+        shape=content.shape,
     )
 
 

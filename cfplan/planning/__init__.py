@@ -1,3 +1,13 @@
 """From a path and limits to a certified plan: the choice of planner, repair, and plan files."""
 
-__all__ = ["active_limits", "continuation", "figure", "plan", "plan_file", "plan_result", "planners", "repair"]
+__all__ = [
+    "active_limits",
+    "continuation",
+    "fastest_path",
+    "figure",
+    "plan",
+    "plan_file",
+    "plan_result",
+    "planners",
+    "repair",
+]

@@ -16,6 +16,7 @@ from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.random_paths import perturbed
+from cfplan.planning.fastest_path import chosen_path
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
@@ -88,6 +89,8 @@ def path_robustness(
         raise InputError(
             "draws must be at least 1 and scales above 0 m", where="robustness", hint="leave them out for the usual"
         )
+
+    path_file, _ = chosen_path(path_file, limits, models=models)
 
     def planned(path: Path) -> Plan:
         factor, yaw = path_file.speed, path_file.yaw

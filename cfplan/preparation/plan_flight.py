@@ -14,6 +14,7 @@ from cfplan.geometry.path_file import PathFile, load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.task import PlanningTask
+from cfplan.planning.fastest_path import chosen_path
 from cfplan.planning.plan import default_budget, plan
 from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.planning.plan_result import Plan
@@ -130,13 +131,13 @@ def plan_flight(
     options = options or FlightOptions()
     with step(on_step, "path") as results:
         path_file = load_path_file(source) if isinstance(source, Path) else source
+        deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)
+        path_file, fastest = chosen_path(path_file, limits, budget=deadline.left, models=options.models)
         check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(path_file.source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
-        for loss in path_file.losses:
-            results.append(loss)
+        results += path_file.losses
     if path_file.path.length > LONG:
         compile_from_here()
-    deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)
     with step(on_step, "plan") as results:
         planned = plan(
             path_file.path,
@@ -153,6 +154,8 @@ def plan_flight(
         left = deadline.left
         at_share = f" at {planned.speed_factor:g} of full speed" if planned.speed_factor < 1.0 else ""
         results.append(f"{planned.trajectory.duration:.2f} s of flight{at_share} by {planned.planner}")
+        if fastest:
+            results.append(fastest.describe(planned.speed_factor))
         if planned.left_out:
             results.warn(f"the budget of time is spent: {planned.left_out}")
         results.details += planned.notes

@@ -62,15 +62,23 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
         for number, point in enumerate(points, start=1):
             if not space.holds(point):
                 _refuse(space, point, f"waypoint {number}", where)
-    s = (path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)).reshape(-1)
-    points = path(s)
-    # Between two samples a coordinate exceeds both by at most step² / 8 of its second derivative.
-    bend = np.abs(path(s, 2)).reshape(-1, _SAMPLES, 3).max(axis=1)
+    s, beyond = distances_beyond(path, space)
+    worst = np.unravel_index(np.argmax(beyond), beyond.shape)
+    if not inside(beyond[worst]):
+        _refuse(space, path(s[worst]), f"the path at s = {s[worst]:.2f} of {path.end:.2f} m", where)
+
+
+def distances_beyond(path: Path, space: Space) -> tuple[NDArray, NDArray]:
+    """Return s, (M, N), along each of the M pieces, and how far the path lies beyond the space around there, (M, N) m.
+
+    The distance is that of the worst coordinate from the box less its margin, negative inside. It holds between the
+    samples too, where a coordinate exceeds both by at most step² / 8 of its second derivative.
+    """
+    s = path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
+    bend = np.abs(path(s, 2)).max(axis=1)
     step = np.diff(path.breaks) / (_SAMPLES - 1)
-    between = np.repeat(step[:, None] ** 2 / 8 * bend, _SAMPLES, axis=0)
-    worst = int(np.argmax((space.beyond(points) + between).max(axis=1)))
-    if not np.all(inside(space.beyond(points[worst]) + between[worst])):
-        _refuse(space, points[worst], f"the path at s = {s[worst]:.2f} of {path.end:.2f} m", where)
+    between = (step[:, None] ** 2 / 8 * bend)[:, None]
+    return s, (space.beyond(path(s)) + between).max(axis=-1)
 
 
 def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:

@@ -38,3 +38,20 @@ def test_details_are_told_to_who_asks(planned):
 def test_the_bound_is_in_the_document(planned):
     document = planned("--json").json
     assert 0.8 * document["duration"] < document["lower_bound"] < document["duration"]
+
+
+def test_the_choice_of_a_fastest_path_is_told_and_bench_and_robustness_make_the_same(cfplan, path_file, safety_file):
+    rectangle = "waypoints: [[-1.5, 0, 1], [1.5, 0, 1], [1.5, 0.3, 1], [-1.5, 0.3, 1], [-1.5, 0, 1]]"
+    files = path_file(f"{rectangle}\nshape: fastest\n"), "--safety", safety_file()
+    chosen, min_snap = {}, {}
+    for speed in ("1", "0.5"):
+        out = cfplan("plan", *files, "--speed", speed).out
+        chosen[speed], min_snap[speed] = re.findall(r" plan .* fastest path: (\S+) s instead of (\S+) s", out)[0]
+        (flight,) = re.findall(r" plan .* ms  (\d+\.\d+) s of flight", out)
+        assert flight == chosen[speed]
+        assert float(flight) < 0.95 * float(min_snap[speed])
+    assert float(chosen["0.5"]) == pytest.approx(2 * float(chosen["1"]), abs=0.02)
+    (benched,) = cfplan("bench", *files, "--planner", "learned", "--json").json["plans"]
+    assert f"{benched['duration']:.2f}" == chosen["1"]
+    perturbed = cfplan("robustness", *files, "--draws", "1", "--epsilon", "0.001", "--json").json
+    assert f"{perturbed['flight']:.2f}" == chosen["1"]

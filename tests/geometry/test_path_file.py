@@ -9,7 +9,7 @@ import yaml
 
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.geometry.path_file import PathFile, load_path_file
+from cfplan.geometry.path_file import PathFile, PathShape, load_path_file
 from cfplan.geometry.yaw import YawMode
 
 FLIGHTS = sorted((pathlib.Path(__file__).parents[2] / "flights").glob("*.yaml"))
@@ -77,6 +77,12 @@ def test_a_fixed_yaw_turns_with_the_place_and_stays_within_half_a_turn(load):
     assert flight.yaw_angle == pytest.approx(math.radians(-170))
 
 
+def test_the_shape_is_min_snap_unless_the_file_says_otherwise(load):
+    assert load({"waypoints": CORNERS}).shape is load({"waypoints": CORNERS, "shape": "min-snap"}).shape
+    assert load({"waypoints": CORNERS}).shape is PathShape.MIN_SNAP
+    assert load({"waypoints": CORNERS, "shape": "fastest"}).shape is PathShape.FASTEST
+
+
 @pytest.mark.parametrize("separator", [",", ";", " ", "\t", ", "])
 def test_points_come_from_a_file_however_they_are_separated(load, separator):
     text = f"x{separator}y{separator}z\n# a comment\n\n" + "".join(
@@ -118,6 +124,17 @@ def test_hundreds_of_points_keep_their_shape(load):
         ("waypoints: [[0,0,1],[1,0,1]]\nyaw: left\n", ":2:6: yaw should be 'fixed', 'tangent' or 'free'"),
         ("waypoints: [[0,0,1],[1,0,1]]\nyaw: {mode: free, angle_deg: 9}\n", ":2:19: angle_deg is for mode fixed only"),
         ("waypoints: [[0,0,1],[1,0,1]]\nyaws: free\n", ":2:1: unknown key 'yaws' (hint: did you mean 'yaw'?"),
+        (
+            "waypoints: [[0,0,1],[1,0,1]]\nshape: quick\n",
+            ":2:8: shape should be 'min-snap' or 'fastest', not \"quick\" (hint: ",
+        ),
+        ("shape:\nwaypoints: [[0,0,1],[1,0,1]]\n", ":1:7: shape should be 'min-snap' or 'fastest'"),
+        (
+            "points: one.csv\nshape: fastest\n",
+            ":2:1: shape is for waypoints only: the curve of points is kept as it is given (hint: leave shape out",
+        ),
+        ("polynomials: one.csv\nshape: min-snap\n", ":2:1: shape is for waypoints only: the curve of polynomials"),
+        ("samples: one.csv\nshape: fastest\n", ":2:1: shape is for waypoints only: the curve of samples"),
         ("points: gone.csv\n", "gone.csv: no such file"),
         ("polynomials: .\n", "a folder, not a file"),
         (
