@@ -33,15 +33,17 @@ from cfplan.planning.planners import AUTO, PLANNERS, default_nodes, find_planner
 from cfplan.planning.repair import refine, repair, slow
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
-from cfplan.safety.limits import FlightLimits, Ladder, Limits
+from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.safety.space import Space
 from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.geometric_flight import LOST
 from cfplan.vehicle.trajectory import Trajectory
 from cfplan.version import REPOSITORY
 from studies.adversarial_paths import FAMILIES, adversarial_path
 from studies.drawn_limits import GROUPS, draw_case
 from studies.drawn_paths import path_of_length, random_path
+from studies.runner.limits import lost_alone
 from studies.runner.machine import process_memory
 from studies.runner.options import option
 from studies.runner.reductions import count, farthest, largest, mean, median, quantile
@@ -52,7 +54,6 @@ LENGTHS = (20.0, 40.0, 100.0, 200.0, 400.0, 1000.0, 2000.0)  # m, 1 to 100 times
 EXPERT, TOPPQUAD = "expert", "toppquad"
 FLOWN = ("learned", EXPERT)  # planners whose setpoints are encoded and rehearsed
 REFINED = ("learned", "convex")  # planners whose profiles are refined to the optimum
-LOST = 1.0  # m, deviation at which a dry run has failed
 PATIENCE = 5.0  # multiple of the budget after which planning counts as hanging
 ENDURANCE, ROOM = 1e6, 3000.0  # s of battery life and m of room to each side, for hard paths
 
@@ -338,7 +339,7 @@ def _rehearsed(trial: Trial, trajectory: Trajectory | None, chosen: LimitSet) ->
     except NotCertifiedError as error:  # a place too far out for a packet
         return replace(trial, bytes_refused=str(error))
     seconds = time.process_time() - begun
-    run = dry_run(encoded, trajectory, chosen.airframe, _lost_alone())
+    run = dry_run(encoded, trajectory, chosen.airframe, lost_alone())
     return replace(trial, encode_seconds=seconds, deviation=run.deviation, dry_run=run.reason)
 
 
@@ -348,13 +349,6 @@ def _warm_up(name: str, limits: str) -> None:
     chosen, path = LIMIT_SETS.get(limits, LIMIT_SETS["hardware"]), random_path(0, next(iter(BOXES)))
     with suppress(CfplanError):
         _planned(Trial("", 0, name, path.length, 100), Case("", 0, path, chosen, 100))
-
-
-def _lost_alone() -> FlightLimits:
-    never, lost = Ladder(np.inf, np.inf, np.inf), Ladder(LOST, LOST, LOST)
-    return FlightLimits(
-        deviation=lost, fence=never, speed=never, acceleration=never, angular_velocity=never, patience=1.0
-    )
 
 
 def _memory_begins() -> float:

@@ -19,7 +19,6 @@ from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import refine, repair
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.safety.limits import FlightLimits, Ladder
 from cfplan.simulation.dry_run import dry_run
 from cfplan.simulation.geometric_flight import LOST, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
@@ -36,6 +35,7 @@ from studies.paper.trials import (
     profile_of,
     training_table,
 )
+from studies.runner.limits import lost_alone
 from studies.runner.options import option
 from studies.runner.reductions import count, farthest, largest, mean
 from studies.runner.result import Column, Table, table
@@ -119,15 +119,6 @@ def _shipped(trial: PaperTrial, path: Path) -> PaperTrial:
 def _planned_violation(trajectory: Trajectory) -> float:
     state = trajectory.at(np.arange(0.0, trajectory.duration, SAMPLE))
     return thrust_violation(state.motor_thrust, trajectory.airframe)
-
-
-def lost_alone() -> FlightLimits:
-    """Return flight limits that end a flight only when it is LOST."""
-    never = Ladder(np.inf, np.inf, np.inf)
-    return FlightLimits(
-        deviation=Ladder(LOST, LOST, LOST), fence=never, speed=never, acceleration=never, angular_velocity=never,
-        patience=1.0,
-    )  # fmt: skip
 
 
 STUDY = Study(Settings, work, tables, "-o results/architectures.json")

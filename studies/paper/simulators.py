@@ -26,7 +26,7 @@ from cfplan.simulation.geometric_flight import LOST, positions_by_both
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
-from studies.paper.architectures import SHIPPED_LIMITS, amid, lost_alone, shipped_task
+from studies.paper.architectures import SHIPPED_LIMITS, amid, shipped_task
 from studies.paper.hardware import CERTIFIED, RAW, TRACKED, encoded_plan, hardware_paths, paper_limits
 from studies.paper.printed import TEST
 from studies.paper.trained import NetworkSettings, TrainedNetwork, paper_data
@@ -44,6 +44,7 @@ from studies.paper.trials import (
     shipped_profile,
 )
 from studies.physics import BODIES, OtherBody, compared
+from studies.runner.limits import lost_alone
 from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table

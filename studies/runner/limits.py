@@ -1,11 +1,13 @@
-"""The limits under which a study flies: those of the nearest safety.yaml."""
+"""The limits under which a study flies: those of the nearest safety.yaml, or one that ends only lost flights."""
 
+import math
 from pathlib import Path
 
 from cfplan.errors import InputError
 from cfplan.files.nearest import nearest
-from cfplan.safety.limits import Limits
+from cfplan.safety.limits import FlightLimits, Ladder, Limits
 from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.geometric_flight import LOST
 
 
 def limits_for(path_file: Path) -> Limits:
@@ -17,3 +19,12 @@ def limits_for(path_file: Path) -> Limits:
     if found is None:
         raise InputError("no safety.yaml in or above this folder", where=str(path_file), hint="run in the repository")
     return load_limits(found)
+
+
+def lost_alone() -> FlightLimits:
+    """Return flight limits that end a flight only when it is LOST."""
+    never = Ladder(math.inf, math.inf, math.inf)
+    return FlightLimits(
+        deviation=Ladder(LOST, LOST, LOST), fence=never, speed=never, acceleration=never, angular_velocity=never,
+        patience=1.0,
+    )  # fmt: skip
