@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cfplan.errors import InputError
-from cfplan.files.text import read_table
+from cfplan.files.text import read_table, read_timed_table
 from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
 from cfplan.geometry.min_snap import (
     MIN_DENSE_SPACING,
@@ -257,7 +257,8 @@ def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]
 def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
     """Return path and points, and what is lost."""
     file = _beside(places, content.samples)
-    rows, lines = read_table(file, 4, "t, x, y, z")
+    rows, lines, others = read_timed_table(file, ("x", "y", "z"), "yaw")
+    rows[:, 0] -= rows[0, 0]
     motion = timed_samples(rows, lines, str(file))
     points = _repeated(motion.points(), content.laps, places)
     check_points(points, MIN_DENSE_SPACING, lambda _: str(file))
@@ -268,7 +269,8 @@ def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
             hint="give a longer motion, or list waypoints",
         )
     path = smooth_through(points)
-    return path, points, *motion.losses(path)
+    left_out = (f"columns are not used: {', '.join(others)}",) if others else ()
+    return path, points, *motion.losses(path), *left_out
 
 
 _SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {

@@ -227,11 +227,11 @@ def test_a_path_of_one_polynomial_has_two_pieces(tmp_path):
 
 
 def halves_of_a_line() -> tuple[np.ndarray, np.ndarray]:
-    """A line of 1 m from rest to rest within 5 s in two pieces: acceleration is 0 at the joint, as at the ends."""
+    """A line of 1 m from rest to rest within 4 s in two pieces: acceleration is 0 at the joint, as at the ends."""
     whole = np.zeros((1, 8, 3))
     whole[0, 4:, 0] = [35, -84, 70, -20]
-    whole /= 5.0 ** np.arange(8)[:, None]
-    return np.full(2, 2.5), np.concatenate([shifted(whole, np.array([t])) for t in (0.0, 2.5)])
+    whole /= 4.0 ** np.arange(8)[:, None]
+    return np.full(2, 2.0), np.concatenate([shifted(whole, np.array([t])) for t in (0.0, 2.0)])
 
 
 def test_a_jump_is_weighed_against_the_pieces_not_only_their_joints(tmp_path):
