@@ -7,6 +7,7 @@ import pathlib
 import re
 import select
 import stat
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,8 @@ from cfplan.errors import InputError
 
 MAX_FILE_SIZE = 4_000_000  # bytes; a path or a set of limits is a few kilobytes
 MAX_NUMBER = 1e6  # metres, seconds or coefficients: a larger number is a slip and would cost digits
+TIMES = ("t", "time", "timestamp")  # possible names of the time column
+_MAX_UNIX_TIME = 1e10  # s since 1970: beyond this a time is in other units
 PIPE_PATIENCE = 5.0  # s without a byte
 DECIMAL_COMMA_HINT = "write decimals with a point, as 1.5, and the same separator between all numbers"
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
@@ -81,31 +84,58 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
         InputError: a row of another length, commas that may be decimal ones, or a number that is not finite, with its
             line; no rows.
     """
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    header_allowed = True
+    _, lines = _split(file, what)
+    rows = [_numbers(cells, range(columns), columns, what, f"{file}:{number}") for number, cells in lines]
+    return np.array(rows), [number for number, _ in lines]
+
+
+def read_timed_table(file: pathlib.Path, names: Sequence[str], more: str) -> tuple[NDArray, list[int], list[str]]:
+    """Read rows of a time, s, and `names`; the line number of each; and the columns that the file has besides.
+
+    A first line that names all of them, in any case, says where they are. Otherwise they are the first columns, in this
+    order, and one column may follow that is called `more`. Times may count from 1970.
+
+    Raises:
+        InputError: as read_table().
+    """
+    what = ", ".join(("t", *names))
+    header, lines = _split(file, what)
+    heads = [cell.strip("\"'").lower() for cell in header]
+    time = next((name for name in TIMES if name in heads), None)
+    if time is None or not set(names) <= set(heads):
+        time, heads = "t", ["t", *names]
+        heads += [more] if len(lines[0][1]) == len(heads) + 1 and lines[0][1][-1] else []
+        what += "; or name the columns so in the first line"
+    columns = [heads.index(name) for name in (time, *names)]
+    rows = [
+        _numbers(cells, columns, len(heads), what, f"{file}:{number}", first=_MAX_UNIX_TIME) for number, cells in lines
+    ]
+    others = [name for column, name in enumerate(heads) if column not in columns and name]
+    return np.array(rows), [number for number, _ in lines], others
+
+
+def _split(file: pathlib.Path, what: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the cells of the header, none if there is no header, and the line number and cells of each row."""
+    header: list[str] = []
+    rows: list[tuple[int, list[str]]] = []
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         text = line.strip()
         if not text or text.startswith("#"):
             continue
         cells = _SEPARATOR.split(text)
-        if cells[-1] == "" and len(cells) == columns + 1:  # a comma at the end of the line
-            cells.pop()
-        if header_allowed and not any(is_number(cell) for cell in cells):
-            header_allowed = False
+        if not header and not rows and not any(is_number(cell) for cell in cells):
+            header = cells
             continue
-        header_allowed = False
         if may_have_decimal_commas(text):
             raise InputError(
                 f"decimal commas, or two kinds of separators: {text[:40]!r}",
                 where=f"{file}:{number}",
                 hint=DECIMAL_COMMA_HINT,
             )
-        rows.append(_numbers(cells, columns, what, f"{file}:{number}"))
-        lines.append(number)
+        rows.append((number, cells))
     if not rows:
         raise InputError("no rows of numbers", where=str(file), hint=f"each row is {what}")
-    return np.array(rows), lines
+    return header, rows
 
 
 def may_have_decimal_commas(text: str) -> bool:
@@ -113,25 +143,33 @@ def may_have_decimal_commas(text: str) -> bool:
     return bool(re.search(r"\d,\d", text) and re.search(r";|[^\s,;]\s+[^\s,;]", text))
 
 
-def _numbers(cells: list[str], columns: int, what: str, where: str) -> list[float]:
-    if len(cells) != columns:
-        raise InputError(f"the row has {len(cells)} numbers, not {columns}", where=where, hint=f"each row is {what}")
-    for column, cell in enumerate(cells, start=1):
+def _numbers(
+    cells: list[str], columns: Sequence[int], width: int, what: str, where: str, *, first: float = MAX_NUMBER
+) -> list[float]:
+    """Return the numbers in some columns of a row of `width` cells; `first` is the largest in the first of them."""
+    if cells[-1] == "" and len(cells) == width + 1:  # a comma at the end of the line
+        cells = cells[:-1]
+    if len(cells) != width:
+        raise InputError(f"the row has {len(cells)} numbers, not {width}", where=where, hint=f"each row is {what}")
+    for column in columns:
+        cell, most = cells[column], first if column == columns[0] else MAX_NUMBER
         if not is_number(cell):
             raise InputError(
-                f"column {column} is not a number: {cell[:40]!r}", where=where, hint="write a plain decimal number"
+                f"column {column + 1} is not a number: {cell[:40]!r}", where=where, hint="write a plain decimal number"
             )
         if not math.isfinite(float(cell)):
             raise InputError(
-                f"column {column} is not a finite number: {cell[:40]}", where=where, hint="write a plain decimal number"
+                f"column {column + 1} is not a finite number: {cell[:40]}",
+                where=where,
+                hint="write a plain decimal number",
             )
-        if abs(float(cell)) > MAX_NUMBER:
+        if abs(float(cell)) > most:
             raise InputError(
-                f"column {column} is larger than {MAX_NUMBER:g}: {cell[:40]}",
+                f"column {column + 1} is larger than {most:g}: {cell[:40]}",
                 where=where,
                 hint="write metres and seconds",
             )
-    return [float(cell) for cell in cells]
+    return [float(cells[column]) for column in columns]
 
 
 def is_number(text: str) -> bool:

@@ -20,6 +20,7 @@ from cfplan.machine_code import njit
 
 MIN_SPACING = 0.01  # m, two waypoints in a row that are closer are one point mistyped
 MIN_DENSE_SPACING = 0.001  # m, the same for lists of points
+REMOVE_HINT = "remove one of them"
 MAX_COORDINATE = 1e5  # m from the origin along each axis: beyond this rounding costs millimetres
 REST = np.zeros((3, 3))  # γ', γ'', γ''' at an end that rests
 
@@ -84,10 +85,15 @@ def spaced(points: NDArray) -> NDArray:
     return np.array(kept).reshape(-1, 3)
 
 
-def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[[int], str] | None = None) -> None:
+def check_points(
+    points: NDArray,
+    spacing: float = MIN_SPACING,
+    where: Callable[[int], str] | None = None,
+    near_hint: str = REMOVE_HINT,
+) -> None:
     """Refuse too few points, points too far from the origin, and neighbours closer than `spacing`, m.
 
-    `where` turns the index of a point into the place that error messages name.
+    `where` turns the index of a point into the place that error messages name; `near_hint` helps with near neighbours.
     """
     where = where or (lambda index: f"waypoint {index + 1}")
     if points.ndim != 2 or points.shape[1] != 3:
@@ -114,7 +120,7 @@ def check_points(points: NDArray, spacing: float = MIN_SPACING, where: Callable[
         raise InputError(
             f"waypoints {near + 1} and {near + 2} are {distances[near]:.4f} m apart, less than {spacing} m",
             where=where(near + 1),
-            hint="remove one of them",
+            hint=near_hint if distances[near] else f"{REMOVE_HINT}: a path cannot wait at a waypoint",
         )
 
 

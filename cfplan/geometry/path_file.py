@@ -1,7 +1,8 @@
 """Path files, path.yaml: which curve to fly, where in the room, with which yaw.
 
 name: figure eight
-waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (x, y, z a row)
+waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (waypoints, x, y, z a row)
+                                        # or  curve: file.csv  (samples of a curve, x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
                                         # or  samples: file.csv  (t, x, y, z a row; the way is kept, the timing not)
 shape: fastest                          # of waypoints: segment times are chosen when planning; min-snap if left out
@@ -23,16 +24,23 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cfplan.errors import InputError
-from cfplan.files.text import read_table
+from cfplan.files.text import read_table, read_timed_table
 from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
-from cfplan.geometry.min_snap import MIN_DENSE_SPACING, MIN_SPACING, check_points, min_snap, smooth_through
+from cfplan.geometry.min_snap import (
+    MIN_DENSE_SPACING,
+    MIN_SPACING,
+    REMOVE_HINT,
+    check_points,
+    min_snap,
+    smooth_through,
+)
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
 from cfplan.geometry.timed_samples import timed_samples
 from cfplan.geometry.yaw import YawMode
 
 _LEAST_SAMPLED = 4  # points that a smooth path with free ends needs
-_DENSE = 8  # points: fewer are waypoints with room between them to gather speed
+_MANY_WAYPOINTS = 50  # rows of `points`: more are rather samples of a curve
 _MAX_POINTS = 50_000  # over all laps
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
@@ -56,7 +64,7 @@ class PathFile:
     laps: int
     waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
-    losses: tuple[str, ...] = ()  # what the path does not keep of what was given, a few words each
+    losses: tuple[str, ...] = ()  # what the path does not keep or mistakes in what was given, a few words each
     shape: PathShape = PathShape.MIN_SNAP
 
 
@@ -97,6 +105,7 @@ class _Content(BaseModel):
     name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
     waypoints: list[list[float]] | None = None
     points: str | None = None
+    curve: str | None = None
     polynomials: str | None = None
     samples: str | None = None
     shape: PathShape = PathShape.MIN_SNAP
@@ -115,11 +124,11 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content)
     given = _source(content, places)
-    if "shape" in content.model_fields_set and given != "waypoints":
+    if "shape" in content.model_fields_set and given not in ("waypoints", "points"):
         raise InputError(
-            f"shape is for waypoints only: the curve of {given} is kept as it is given",
+            f"shape is for waypoints and points only: `{given}` is flown as it is given",
             where=places.where_key("shape"),
-            hint="leave shape out, or list waypoints",
+            hint="leave shape out, or give waypoints or points",
         )
     path, waypoints, *losses = _SOURCES[given](content, places)
     path.check(where=places.where(given))
@@ -149,7 +158,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
 
 
 def path_through(points: ArrayLike, name: str = "points") -> PathFile:
-    """Return the path through points, (K, 3) m, as a file with `points` gives it: at yaw 0, at full speed, one lap.
+    """Return the path through waypoints, (K, 3) m, as a file with `points` gives it: at yaw 0, at full speed, one lap.
 
     Raises:
         InputError: no numbers, another shape, too few, too near to one another, too many, or too far away.
@@ -162,16 +171,10 @@ def path_through(points: ArrayLike, name: str = "points") -> PathFile:
         raise InputError(f"points must have the shape (K, 3), not {rows.shape}", where=name, hint=_POINTS_HINT)
     if len(rows) > _MAX_POINTS:
         raise InputError(f"more than {_MAX_POINTS} points", where=name, hint="give fewer points")
-    spacing, through = _curve_of(rows)
-    check_points(rows, spacing, lambda index: f"{name}, row {index + 1}")
-    path = through(rows)
+    check_points(rows, MIN_SPACING, lambda index: f"{name}, row {index + 1}")
+    path = min_snap(rows)
     path.check(where=name)
     return PathFile(name, path, YawMode.FIXED, 0.0, 1.0, 1, rows, pathlib.Path(name))
-
-
-def read_points(file: pathlib.Path) -> tuple[NDArray, list[int]]:
-    """Read points, (K, 3) m, from rows of x, y, z, and the line number of each."""
-    return read_table(file, 3, "x, y, z; write `samples:` for rows of t, x, y, z")
 
 
 def _source(content: _Content, places: Places) -> str:
@@ -213,22 +216,38 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
     return min_snap(points), points
 
 
-def _from_points(content: _Content, places: Places) -> tuple[Path, NDArray]:
-    file = _beside(places, content.points)
-    points, lines = read_points(file)
+def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
+    """Return path and waypoints, and a word if these are rather samples of a curve."""
+    rows = _read_points(places, content.points, MIN_SPACING)
+    points = _repeated(rows, content.laps, places)
+    words = (f"{len(rows)} rows are waypoints here: write `curve: {content.points}` if they are samples of a curve",)
+    return min_snap(points), points, *(words if len(rows) >= _MANY_WAYPOINTS else ())
+
+
+def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
+    points = _read_points(places, content.curve, MIN_DENSE_SPACING)
+    if len(points) < _LEAST_SAMPLED:
+        raise InputError(
+            f"a curve needs at least {_LEAST_SAMPLED} samples, not {len(points)}",
+            where=str(_beside(places, content.curve)),
+            hint="add rows x, y, z to the file, or write `points:` if they are waypoints",
+        )
+    points = _repeated(points, content.laps, places)
+    return smooth_through(points), points
+
+
+def _read_points(places: Places, name: str | None, spacing: float) -> NDArray:
+    """Return two points or more, (K, 3) m, `spacing`, m, apart or more, from a file beside the path file."""
+    file = _beside(places, name)
+    points, lines = read_table(file, 3, "x, y, z; write `samples:` for rows of t, x, y, z")
     if len(points) < 2:
         raise InputError(
             f"a path needs at least two points, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
         )
-    spacing, through = _curve_of(points)
-    check_points(points, spacing, lambda index: f"{file}:{lines[index]}")
-    points = _repeated(points, content.laps, places)
-    return through(points), points
-
-
-def _curve_of(points: NDArray) -> tuple[float, Callable[[NDArray], Path]]:
-    """Return how near points may be, m, and the curve through them: many are samples, few are waypoints."""
-    return (MIN_DENSE_SPACING, smooth_through) if len(points) >= _DENSE else (MIN_SPACING, min_snap)
+    many = spacing == MIN_SPACING and len(points) >= _MANY_WAYPOINTS
+    hint = f"write `curve: {name}` if the rows are samples of a curve, or remove one of them" if many else REMOVE_HINT
+    check_points(points, spacing, lambda index: f"{file}:{lines[index]}", hint)
+    return points
 
 
 def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]:
@@ -238,7 +257,8 @@ def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]
 def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
     """Return path and points, and what is lost."""
     file = _beside(places, content.samples)
-    rows, lines = read_table(file, 4, "t, x, y, z")
+    rows, lines, others = read_timed_table(file, ("x", "y", "z"), "yaw")
+    rows[:, 0] -= rows[0, 0]
     motion = timed_samples(rows, lines, str(file))
     points = _repeated(motion.points(), content.laps, places)
     check_points(points, MIN_DENSE_SPACING, lambda _: str(file))
@@ -249,11 +269,13 @@ def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
             hint="give a longer motion, or list waypoints",
         )
     path = smooth_through(points)
-    return path, points, *motion.losses(path)
+    left_out = (f"columns are not used: {', '.join(others)}",) if others else ()
+    return path, points, *motion.losses(path), *left_out
 
 
 _SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {
-    "waypoints": _from_waypoints, "points": _from_points, "polynomials": _from_polynomials, "samples": _from_samples,
+    "waypoints": _from_waypoints, "points": _from_points, "curve": _from_curve,
+    "polynomials": _from_polynomials, "samples": _from_samples,
 }  # fmt: skip
 
 

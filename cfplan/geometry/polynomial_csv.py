@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.files.text import read_table
 from cfplan.geometry.path import Path
-from cfplan.geometry.polynomials import end_values
+from cfplan.geometry.polynomials import end_values, largest_values
 from cfplan.geometry.rest import close_joints, with_rest_ends
 
 ROW = "duration, x^0 to x^7, y^0 to y^7, z^0 to z^7, yaw^0 to yaw^7"
 _COLUMNS = 1 + 4 * 8
 _MIN_DURATION = 0.001  # s
 _POSITION_STEP = 0.001  # m allowed between pieces
-_DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative of that order: covers six decimals
+_DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative along any of them: covers six decimals
 _HEADER = ["duration", *(f"{axis}^{power}" for axis in ("x", "y", "z", "yaw") for power in range(8))]
 _NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 _UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
@@ -67,8 +67,7 @@ def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, tabl
             where=f"{file}:{lines[int(np.argmin(extent))]}",
             hint="remove the row; a path cannot wait",
         )
-    largest = np.linalg.norm(np.concatenate([left, right]), axis=-1).max(axis=0)
-    allowed = np.maximum(_DERIVATIVE_STEP * largest, 1e-6)
+    allowed = np.maximum(_DERIVATIVE_STEP * largest_values(durations, table).max(axis=0), 1e-6)
     allowed[0] = _POSITION_STEP
     steps = np.linalg.norm(left[1:] - right[:-1], axis=-1)
     for piece, order in np.argwhere(steps > allowed)[:1]:

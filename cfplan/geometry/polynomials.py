@@ -6,6 +6,8 @@ from math import comb, factorial
 import numpy as np
 from numpy.typing import NDArray
 
+_SAMPLES = 17  # along a piece, to find its largest derivatives
+
 
 def shifted(table: NDArray, offset: NDArray) -> NDArray:
     """Return the same polynomials (M, D, 3), each in powers of x - offset[i], with offset (M,)."""
@@ -31,6 +33,12 @@ def end_values(durations: NDArray, table: NDArray, orders: int = 5) -> tuple[NDA
     table = padded(table, max(orders, table.shape[1]))
     factorials = np.array([factorial(k) for k in range(orders)], dtype=float)[:, None]
     return table[:, :orders] * factorials, shifted(table, durations)[:, :orders] * factorials
+
+
+def largest_values(durations: NDArray, table: NDArray) -> NDArray:
+    """Return the largest norm along each piece of its position and first four derivatives, (M, 5), sampled."""
+    samples = [end_values(durations * part, table)[1] for part in np.linspace(0.0, 1.0, _SAMPLES)]
+    return np.asarray(np.linalg.norm(samples, axis=-1).max(axis=0))
 
 
 def padded(table: NDArray, count: int) -> NDArray:

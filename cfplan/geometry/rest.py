@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
-from cfplan.geometry.polynomials import composed, end_values, hermite, padded, reversed_pieces, shifted
+from cfplan.geometry.polynomials import composed, end_values, hermite, largest_values, padded, reversed_pieces, shifted
 
 WARP = 1.5  # s of nominal time in which speed is gathered; at most half of the path
 _WARP_PIECES = 16
 _TERMS = 16  # Taylor terms kept of the composition
 _NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])  # γ', γ'', γ''' at 1 m/s: an end that moves less is at rest but for rounding
+_ROUNDED = np.array([1e-3, 3e-3, 1e-2])  # the same, of the largest along the piece: six decimals of a slow file
 _HERMITE = hermite(5)
 
 
@@ -82,9 +83,10 @@ def _at_nominal_speed(durations: NDArray, table: NDArray) -> tuple[NDArray, NDAr
 
 def _with_rest_start(durations: NDArray, table: NDArray, most: float) -> tuple[NDArray, NDArray]:
     start = end_values(durations[:1], table[:1])[0][0]
-    moving = np.linalg.norm(start[1:4], axis=-1) > _NEGLIGIBLE
-    if moving.any():
-        return _warped(durations, table, 3 if moving[0] else 1, most)
+    values = np.linalg.norm(start[1:4], axis=-1)
+    largest = largest_values(durations[:1], table[:1])[0, 1:4]
+    if (values > np.maximum(_NEGLIGIBLE, _ROUNDED * largest)).any():
+        return _warped(durations, table, 3 if values[0] > _NEGLIGIBLE[0] else 1, most)
     change = np.zeros((1, 5, 3))
     change[0, 1:4] = -start[1:4]
     return durations, _changed(durations, table, change, np.zeros((1, 5, 3)), slice(0, 1))

@@ -17,7 +17,7 @@ from cfplan.simulation.dry_run import DryRun
 
 
 def load_path(source: Path | str | ArrayLike) -> PathFile:
-    """Return the path of a path file, or through points, (K, 3) m, at yaw 0: 8 points or more are samples of a curve.
+    """Return the path of a path file, or through waypoints, (K, 3) m, at yaw 0.
 
     Raises InputError, with place and hint, if the file does not exist or has a mistake, or the points are not such.
     """
@@ -36,7 +36,7 @@ def plan(
     """Plan a path under limits and certify it, as `cfplan plan` does; or read a plan file and certify it anew.
 
     Args:
-        path: from load_path, or a path file, or a plan file (.parquet), or points, (K, 3) m, as load_path takes them.
+        path: from load_path, or a path file, or a plan file (.parquet), or waypoints, (K, 3) m.
         limits: from load_limits, or a safety.yaml.
         planner: "auto", "learned", "expert", "convex", …; docs/planning.md has them.
         speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes the path's own.

@@ -126,6 +126,10 @@ def _yaw_and_place(folder: Path) -> list[Sound]:
     return [*_flights("waypoints", folder), {"path.yaml": own}]
 
 
+def _points(_: Path) -> list[Sound]:
+    return [{"path.yaml": b"points: rows.csv\nlaps: 2\n", "rows.csv": b"x,y,z\n0,0,1\n1,0,1\n1,1,1.2\n0,0,1\n"}]
+
+
 def _samples(_: Path) -> list[Sound]:
     rows = [f"{n / 10},{np.cos(n / 10):.4f},{np.sin(n / 10):.4f},1.0" for n in range(40)]
     return [{"path.yaml": b"samples: log.csv\n", "log.csv": "\n".join(["t,x,y,z", *rows]).encode()}]
@@ -381,7 +385,8 @@ def _use_vicon(folder: Path) -> None:
 
 FILES = {
     "paths": Input(_yaw_and_place, spoil_one_file, _use_path),
-    "points": Input(partial(_flights, "points"), spoil_one_file, _use_path),
+    "points": Input(_points, spoil_one_file, _use_path),
+    "curve": Input(partial(_flights, "curve"), spoil_one_file, _use_path),
     "polynomials": Input(partial(_flights, "polynomials"), spoil_one_file, _use_path),
     "samples": Input(_samples, spoil_one_file, _use_path),
     "safety": Input(_safety, spoil_one_file, _use_safety, 2.0),

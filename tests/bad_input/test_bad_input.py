@@ -22,7 +22,7 @@ from tests.bad_input.packets import PACKETS
 
 INPUTS = FILES | PACKETS
 EXAMPLES = int(os.environ.get("BAD_INPUTS", "600")) / sum(kind.fraction for kind in INPUTS.values())
-PLANNED = ("paths", "points", "polynomials", "samples", "safety", "airframes")  # valid input may be infeasible
+PLANNED = ("paths", "points", "curve", "polynomials", "samples", "safety", "airframes")  # valid input may be infeasible
 _PROCESSOR_TIME = 10.0  # s for one input, not counting other processes
 _MOST_MEMORY = 1_000_000  # kB for one input
 _ADDRESSES = 6 << 30  # bytes of address space for one input, so that it cannot exhaust the machine

@@ -31,7 +31,7 @@ BAD_PATHS = {
     "no such file of points": ("points: nowhere.csv\n", 2),
     "millimetres": ("waypoints: [[0, -1500, 1000], [300, 1500, 1000]]\n", 3),
     "an unknown shape": (LINE + "shape: fast\n", 2),
-    "a shape of points": ("points: line.csv\nshape: fastest\n", 2),
+    "a shape of a curve": ("curve: line.csv\nshape: fastest\n", 2),
     "a path under the floor": ("waypoints: [[0, 0, 1], [1, 0, -0.1]]\n", 3),
     "a yaw without its mode": (LINE + "yaw: 90\n", 2),
     "a speed that is no share": (LINE + "speed: 2\n", 2),

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from cfplan.errors import InputError
-from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.min_snap import min_snap, smooth_through
 from cfplan.geometry.path_file import PathFile, PathShape, load_path_file
 from cfplan.geometry.yaw import YawMode
 
@@ -93,11 +93,44 @@ def test_points_come_from_a_file_however_they_are_separated(load, separator):
     np.testing.assert_allclose(flight.path(flight.path.breaks), CORNERS, atol=1e-12)
 
 
-def test_hundreds_of_points_keep_their_shape(load):
-    angle = np.linspace(0, 2 * np.pi, 500)
-    circle = np.column_stack([np.cos(angle), np.sin(angle), 1 + 0 * angle])
-    text = "\n".join(",".join(f"{v:.6f}" for v in point) for point in circle)
-    flight = load({"points": "circle.csv", "laps": 2}, circle=text)
+def table(points) -> str:
+    return "\n".join(",".join(f"{v:.6f}" for v in point) for point in points)
+
+
+def circle(count: int) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, count)
+    return np.column_stack([np.cos(angle), np.sin(angle), 1 + 0 * angle]).round(6)
+
+
+@pytest.mark.parametrize("count", [7, 8, 49])
+def test_the_key_says_whether_rows_are_waypoints_or_samples_and_no_count_does(load, count):
+    rows = circle(count)
+    waypoints, samples = load("points: rows.csv\n", rows=table(rows)), load("curve: rows.csv\n")
+    np.testing.assert_array_equal(waypoints.path.coefficients, min_snap(rows).coefficients)
+    np.testing.assert_array_equal(samples.path.coefficients, smooth_through(rows).coefficients)
+    assert waypoints.losses == samples.losses == ()
+
+
+def test_many_waypoints_recall_the_curve(load):
+    flight = load("points: rows.csv\nshape: fastest\n", rows=table(circle(50)))
+    assert flight.losses == ("50 rows are waypoints here: write `curve: rows.csv` if they are samples of a curve",)
+    assert flight.shape is PathShape.FASTEST
+    with pytest.raises(InputError, match=r"0.0063 m apart.*hint: write `curve: rows.csv`"):
+        load("points: rows.csv\n", rows=table(circle(1000)))
+
+
+@pytest.mark.parametrize("name", ["circle", "lissajous", "scan", "trefoil"])
+def test_a_flight_of_samples_is_the_smooth_curve_through_them(name):
+    (file,) = [file for file in FLIGHTS if file.stem == name]
+    flight = load_path_file(file)
+    rows = np.loadtxt(file.with_suffix(".csv"), delimiter=",", skiprows=1)
+    through = np.concatenate([rows[:1], *[np.concatenate([rows[1:-1], rows[:1]])] * flight.laps])
+    expected = rows if flight.laps == 1 else through
+    np.testing.assert_array_equal(flight.path.coefficients, smooth_through(expected).coefficients)
+
+
+def test_hundreds_of_samples_keep_their_shape(load):
+    flight = load({"curve": "circle.csv", "laps": 2}, circle=table(circle(500)))
     points = flight.path(np.linspace(0, flight.path.end, 3000))
     np.testing.assert_allclose(np.linalg.norm(points[:, :2], axis=1), 1.0, atol=1e-3)
     assert flight.path.length == pytest.approx(4 * np.pi, rel=1e-3)
@@ -106,13 +139,16 @@ def test_hundreds_of_points_keep_their_shape(load):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("name: x\n", ":1:1: one of waypoints, points, polynomials, samples is needed"),
+        ("name: x\n", ":1:1: one of waypoints, points, curve, polynomials, samples is needed"),
         ("points: a.csv\nwaypoints: [[0,0,1],[1,0,1]]\n", ":2:1: only one of waypoints and points may be given"),
         ("waypoints: []\n", ":1:12: a path needs at least two waypoints, not 0"),
         ("waypoints: [[0,0,1]]\n", ":1:12: a path needs at least two waypoints, not 1"),
         ("waypoints: [[0,0,1],[1,1]]\n", ":1:21: waypoint 2 has 2 numbers, not x, y, z"),
         ("waypoints: [[0,0,1],[1,1,1,1]]\n", ":1:21: waypoint 2 has 4 numbers, not x, y, z"),
-        ("waypoints:\n- [0,0,1]\n- [0,0,1]\n", ":3:3: waypoints 1 and 2 are 0.0000 m apart"),
+        (
+            "waypoints:\n- [0,0,1]\n- [0,0,1]\n",
+            ":3:3: waypoints 1 and 2 are 0.0000 m apart, less than 0.01 m (hint: remove one of them: a path cannot",
+        ),
         ("waypoints:\n- [0,0,1]\n- [1,0,1]\n- [1,0.005,1]\n", ":4:3: waypoints 2 and 3 are 0.0050 m apart"),
         ("waypoints:\n- [0,0,1]\n- [1,.nan,1]\n", ":3:6: a finite number is needed, not .nan"),
         ("waypoints:\n- [0,0,1]\n- [1,1e30,1]\n", ":3:3: coordinates must be numbers within"),
@@ -130,11 +166,11 @@ def test_hundreds_of_points_keep_their_shape(load):
         ),
         ("shape:\nwaypoints: [[0,0,1],[1,0,1]]\n", ":1:7: shape should be 'min-snap' or 'fastest'"),
         (
-            "points: one.csv\nshape: fastest\n",
-            ":2:1: shape is for waypoints only: the curve of points is kept as it is given (hint: leave shape out",
+            "curve: one.csv\nshape: fastest\n",
+            ":2:1: shape is for waypoints and points only: `curve` is flown as it is given (hint: leave shape out",
         ),
-        ("polynomials: one.csv\nshape: min-snap\n", ":2:1: shape is for waypoints only: the curve of polynomials"),
-        ("samples: one.csv\nshape: fastest\n", ":2:1: shape is for waypoints only: the curve of samples"),
+        ("polynomials: one.csv\nshape: min-snap\n", ":2:1: shape is for waypoints and points only: `polynomials`"),
+        ("samples: one.csv\nshape: fastest\n", ":2:1: shape is for waypoints and points only: `samples`"),
         ("points: gone.csv\n", "gone.csv: no such file"),
         ("polynomials: .\n", "a folder, not a file"),
         (
@@ -143,13 +179,25 @@ def test_hundreds_of_points_keep_their_shape(load):
         ),
         ("points: one.csv\n", "one.csv: a path needs at least two points, not 1"),
         ("points: twice.csv\n", "twice.csv:4: waypoints 2 and 3 are 0.0000 m apart"),
+        ("curve: twice.csv\n", "twice.csv:4: waypoints 2 and 3 are 0.0000 m apart"),
+        (
+            "curve: few.csv\n",
+            "few.csv: a curve needs at least 4 samples, not 3 (hint: add rows x, y, z to the file, or",
+        ),
         ("points: words.csv\n", "words.csv: no rows of numbers"),
         ("polynomials: one.csv\n", "one.csv:1: the row has 3 numbers, not 33"),
     ],
 )
 def test_each_mistake_is_named_with_its_place(load, content, message):
     with pytest.raises(InputError) as caught:
-        load(content, short="0,0,1\n0,1\n", one="1,2,3\n", twice="0,0,1\n1,0,1\n\n1,0,1\n", words="x,y,z\n")
+        load(
+            content,
+            short="0,0,1\n0,1\n",
+            one="1,2,3\n",
+            twice="0,0,1\n1,0,1\n\n1,0,1\n",
+            few="0,0,1\n1,0,1\n1,1,1\n",
+            words="x,y,z\n",
+        )
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -173,7 +221,7 @@ def test_there_are_flights_of_every_kind():
     flights = [load_path_file(file) for file in FLIGHTS]
     assert {flight.yaw for flight in flights} == set(YawMode)
     texts = [file.read_text() for file in FLIGHTS]
-    assert all(any(f"\n{key}:" in text for text in texts) for key in ("waypoints", "points", "polynomials", "laps"))
+    assert all(any(f"\n{key}:" in text for text in texts) for key in ("waypoints", "curve", "polynomials", "laps"))
 
 
 @pytest.mark.parametrize("file", FLIGHTS, ids=lambda file: file.stem)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
+from cfplan.geometry.min_snap import REST, pieces_through
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomial_csv import read_polynomials
 from cfplan.geometry.polynomials import end_values, hermite, reversed_pieces, shifted
@@ -223,3 +224,34 @@ def test_a_path_of_one_polynomial_has_two_pieces(tmp_path):
     path: Path = with_rest_ends(*helix(turns=0.2, pieces=1))
     assert len(path.breaks) > 2
     assert not path([0.0, path.end], 1).any()
+
+
+def halves_of_a_line() -> tuple[np.ndarray, np.ndarray]:
+    """A line of 1 m from rest to rest within 4 s in two pieces: acceleration is 0 at the joint, as at the ends."""
+    whole = np.zeros((1, 8, 3))
+    whole[0, 4:, 0] = [35, -84, 70, -20]
+    whole /= 4.0 ** np.arange(8)[:, None]
+    return np.full(2, 2.0), np.concatenate([shifted(whole, np.array([t])) for t in (0.0, 2.0)])
+
+
+def test_a_jump_is_weighed_against_the_pieces_not_only_their_joints(tmp_path):
+    durations, table = halves_of_a_line()
+    path, _ = read_polynomials(write(tmp_path / "rounded.csv", durations, table))
+    path.check()
+    assert np.abs(path(np.linspace(0, path.end, 200))[:, 1:]).max() < 1e-9
+    assert path(path.end)[0] == pytest.approx(1.0, abs=1e-3)
+    largest = np.linalg.norm(end_values(durations[:1] / 2, table[:1])[1][0, 2])
+    table[1, 2, 0] += 0.05 * largest / 2
+    with pytest.raises(InputError, match=r":3: acceleration jumps by"):
+        read_polynomials(write(tmp_path / "jump.csv", durations, table))
+
+
+def test_rest_but_for_six_decimals_is_no_cusp(tmp_path):
+    points = np.cumsum(np.random.default_rng(36).uniform(-0.1, 0.1, (6, 3)), axis=0)
+    durations, table = np.ones(5), pieces_through(points, np.ones(5), REST, rest_end=True)
+    path, _ = read_polynomials(write(tmp_path / "slow.csv", durations, table))
+    path.check()
+    for order in (1, 2, 3):
+        assert not path([0.0, path.end], order).any()
+    places = path(np.linspace(0, path.end, 200))
+    assert distance_to_curve(places, sampled(durations, table, 400)).max() < 1e-5

@@ -76,11 +76,46 @@ def test_the_rate_does_not_matter(load):
         (lambda rows: np.array([[0.0, 1.0, 0.0, 1.0], [0.1, 0.995, 0.1, 1.0]]), r"csv: .* too short for a smooth path"),
         (lambda rows: rows + 5.0 * (np.arange(len(rows)) == 77)[:, None] * [0, 1, 0, 0], "jumps by"),
         (lambda rows: rows[:, :3], "3 numbers, not 4"),
+        (lambda rows: rows[:, [0, 1, 2, 3, 1, 1]], "6 numbers, not 4"),
+        (lambda rows: np.add(rows, [1.76e12, 0, 0, 0]), r"larger than 1e\+10"),
     ],
 )
 def test_what_is_no_motion_is_refused_with_the_line(load, spoil, what):
     with pytest.raises(InputError, match=what):
         load(spoil(circle()))
+
+
+@pytest.mark.parametrize(
+    ("header", "columns", "unused"),
+    [
+        ("timestamp,x,y,z,qw,qx,qy,qz", (0, 1, 2, 3, 4, 4, 4, 4), "qw, qx, qy, qz"),
+        ("Time,Z,Y,X", (0, 3, 2, 1), ""),
+        ('"frame","t","x","y","z"', (4, 0, 1, 2, 3), "frame"),
+        ("t,x,y,z,yaw", (0, 1, 2, 3, 4), "yaw"),
+        ("", (0, 1, 2, 3, 4), "yaw"),
+        ("seconds,east,north,up", (0, 1, 2, 3), ""),
+    ],
+)
+def test_columns_are_found_by_their_names_and_others_are_told(load, tmp_path, header, columns, unused):
+    rows = circle()
+    expected = load(rows)
+    wide = np.column_stack([rows, np.ones(len(rows))])[:, columns]
+    np.savetxt(tmp_path / "log.csv", wide, delimiter=",", header=header, comments="")
+    made = load_path_file(tmp_path / "path.yaml")
+    np.testing.assert_array_equal(made.path.coefficients, expected.path.coefficients)
+    assert made.losses == (*expected.losses, *([f"columns are not used: {unused}"] if unused else []))
+
+
+def test_times_may_count_from_1970(load):
+    rows = circle(noise=0.001, rest=3.0)
+    unix = load(np.add(rows, [1_760_000_000.0, 0, 0, 0]))
+    np.testing.assert_array_equal(unix.path.coefficients, load(rows).path.coefficients)
+    assert unix.losses[0] == "timing is not kept: 11.0 s of 1101 samples"
+
+
+def test_a_unix_time_that_goes_back_is_named_by_its_line(load):
+    with pytest.raises(InputError, match=r"csv:4: time goes from"):
+        load(circle()[[0, 2, 1, 3]] + [1_760_000_000.0, 0, 0, 0])
 
 
 def test_laps_need_a_closed_way(load):

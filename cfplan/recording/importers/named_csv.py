@@ -7,11 +7,11 @@ import re
 from pathlib import Path
 
 from cfplan.errors import InputError
+from cfplan.files.text import TIMES
 from cfplan.recording.importers.csv_numbers import read_numbers
 from cfplan.recording.importers.mocap_log import PLACE, QUATERNION, MocapLog, in_order, subject
 
 FORMAT = "CSV of t, x, y, z"
-TIMES = ("t", "time", "timestamp")  # possible names of the time column
 _COLUMN = r"(?=(?:[^\n]*,)?[ \t\"]*(?:%s)[ \t\"]*(?:[,\r\n]|\Z))"  # in the first line
 HEAD = re.compile((r"(?:\xef\xbb\xbf)?" + _COLUMN % "|".join(TIMES) + _COLUMN % "x|qw").encode())
 
