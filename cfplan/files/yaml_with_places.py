@@ -104,6 +104,8 @@ def read_yaml_with_places(
     `complete` adds what the file may leave out.
     """
     text = read_text(pathlib.Path(file), most=MAX_SIZE)
+    if pathlib.Path(file).suffix.lower() == ".toml":
+        raise InputError("a TOML file, not YAML", where=str(file), hint="write `key: value` lines in a .yaml file")
     places = Places(str(file), {}, {})
     root = _composed(text, places.file)
     data = _plain(root, (), places)

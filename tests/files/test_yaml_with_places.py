@@ -130,6 +130,12 @@ def test_a_file_that_is_not_there_is_named(tmp_path):
         read_yaml(pathlib.Path("n" * 5000), Room)
 
 
+def test_toml_is_refused_as_such(tmp_path):
+    (tmp_path / "path.toml").write_text('name = "x"\nwaypoints = [[0, 0, 1], [1, 0, 1]]\n')
+    with pytest.raises(InputError, match=r"path\.toml: a TOML file, not YAML \(hint: write `key: value`"):
+        load_path_file(tmp_path / "path.toml")
+
+
 def test_an_alias_bomb_is_refused_at_its_first_anchor(read):
     lines = ["a: &a [x,x,x,x,x,x,x,x,x,x]"]
     for before, name in zip("abcdefgh", "bcdefghi", strict=True):
