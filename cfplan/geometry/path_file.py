@@ -213,7 +213,7 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
         )
     check_points(points, MIN_SPACING, lambda index: places.where("waypoints", index))
     points = _repeated(points, content.laps, places)
-    return min_snap(points), points
+    return _path_with(min_snap, points, places.where("waypoints")), points
 
 
 def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
@@ -221,7 +221,8 @@ def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
     rows = _read_points(places, content.points, MIN_SPACING)
     points = _repeated(rows, content.laps, places)
     words = (f"{len(rows)} rows are waypoints here: write `curve: {content.points}` if they are samples of a curve",)
-    return min_snap(points), points, *(words if len(rows) >= _MANY_WAYPOINTS else ())
+    path = _path_with(min_snap, points, str(_beside(places, content.points)))
+    return path, points, *(words if len(rows) >= _MANY_WAYPOINTS else ())
 
 
 def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
@@ -233,7 +234,7 @@ def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
             hint="add rows x, y, z to the file, or write `points:` if they are waypoints",
         )
     points = _repeated(points, content.laps, places)
-    return smooth_through(points), points
+    return _path_with(smooth_through, points, str(_beside(places, content.curve))), points
 
 
 def _read_points(places: Places, name: str | None, spacing: float) -> NDArray:
@@ -268,7 +269,7 @@ def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
             where=str(file),
             hint="give a longer motion, or list waypoints",
         )
-    path = smooth_through(points)
+    path = _path_with(smooth_through, points, str(file))
     left_out = (f"columns are not used: {', '.join(others)}",) if others else ()
     return path, points, *motion.losses(path), *left_out
 
@@ -277,6 +278,14 @@ _SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {
     "waypoints": _from_waypoints, "points": _from_points, "curve": _from_curve,
     "polynomials": _from_polynomials, "samples": _from_samples,
 }  # fmt: skip
+
+
+def _path_with(through: Callable[[NDArray], Path], points: NDArray, where: str) -> Path:
+    """Return the path through points. Raises InputError that names `where` too if no smooth path joins them."""
+    try:
+        return through(points)
+    except InputError as error:
+        raise InputError(error.what, where=f"{where}, {error.where}", hint=error.hint) from None
 
 
 def _beside(places: Places, name: str | None) -> pathlib.Path:

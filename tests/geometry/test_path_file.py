@@ -184,6 +184,11 @@ def test_hundreds_of_samples_keep_their_shape(load):
             "curve: few.csv\n",
             "few.csv: a curve needs at least 4 samples, not 3 (hint: add rows x, y, z to the file, or",
         ),
+        ("points: slip.csv\n", "slip.csv, waypoint 4: from the point before it is 65533 m"),
+        (
+            "waypoints: [[65534,0,1],[1,0,1],[1,1,1.2],[65534,0,1]]\n",
+            ":1:12, waypoint 4: from the point before it is 65533 m",
+        ),
         ("points: words.csv\n", "words.csv: no rows of numbers"),
         ("polynomials: one.csv\n", "one.csv:1: the row has 3 numbers, not 33"),
     ],
@@ -197,6 +202,7 @@ def test_each_mistake_is_named_with_its_place(load, content, message):
             twice="0,0,1\n1,0,1\n\n1,0,1\n",
             few="0,0,1\n1,0,1\n1,1,1\n",
             words="x,y,z\n",
+            slip="65534,0,1\n1,0,1\n1,1,1.2\n65534,0,1\n",
         )
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
