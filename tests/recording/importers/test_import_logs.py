@@ -209,7 +209,7 @@ OF_ONE_FILE = [  # format, content, subjects
 
 
 def written(folder, content):
-    file = folder / "log.csv"  # whatever its format: that is told by its content
+    file = folder / "log.csv"  # whatever its format: its content decides
     file.write_bytes(content)
     return file
 

@@ -97,11 +97,11 @@ def test_poses_of_every_layout_come_back(tmp_path, subjects, delimiter, point, o
 
 
 @pytest.mark.parametrize(
-    ("layout", "told", "notes"), [("helical", None, ["taken as helical"]), ("euler", Rotations.EULER, [])]
+    ("layout", "given", "notes"), [("helical", None, ["taken as helical"]), ("euler", Rotations.EULER, [])]
 )
-def test_angles_without_a_word_are_what_the_reader_is_told_else_helical(tmp_path, layout, told, notes):
+def test_angles_without_a_layout_are_read_as_the_given_one_or_else_as_helical(tmp_path, layout, given, notes):
     file = write(tmp_path / "log", {"cf1": (layout, poses())}, name="Segments", angle="deg", title="{subject}:root")
-    log = read_log(file, rotations=told)
+    log = read_log(file, rotations=given)
     assert log.subjects[0].name == "cf1:root"
     assert_same(log.subjects[0], poses())
     assert [note[-len("taken as helical") :] for note in log.notes] == notes
