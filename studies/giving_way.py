@@ -24,7 +24,7 @@ from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import load_path_file
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.fastest_path import chosen_path
+from cfplan.planning.path.choice import chosen_path
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import give_way

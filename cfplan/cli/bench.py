@@ -33,7 +33,7 @@ def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tupl
     limits = options.read_limits(safety_file, path_files[0], steps, compile_to=Stage.PLAN)
     with steps.waiting("loading planners"):
         from cfplan.geometry.path_file import load_path_file
-        from cfplan.planning.fastest_path import chosen_path
+        from cfplan.planning.path.choice import chosen_path
         from cfplan.planning.planners import PLANNERS, find_planner
 
     for name in planners:

@@ -1,7 +1,7 @@
 """`cfplan plan`: plan a certified trajectory for a path file."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -10,6 +10,9 @@ from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
 from cfplan.numbers import shown
 from cfplan.preparation.compiled_calls import Stage
+
+if TYPE_CHECKING:
+    from cfplan.preparation.plan_flight import PlannedFlight
 
 
 @click.command(
@@ -41,9 +44,7 @@ def plan(
 
     flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None and figure is None)
     planned = plan_flight(path_file, limits, flight, steps)
-    with steps.step("bound") as results:
-        bound = planned.lower_bound()
-        results.append(_compared(planned.plan.trajectory.duration, bound, planned.plan.speed_factor))
+    bounds = _bounds(planned, steps)
     if output is not None:
         with steps.step("save") as results:
             planned.save(output, {"path file": str(path_file)})
@@ -53,15 +54,32 @@ def plan(
             planned.save_figure(figure, overwrite=force)
             results.append(str(figure))
     if as_json:
-        print_json(planned.to_dict() | {"lower_bound": bound} | ({"file": str(output)} if output else {}))
+        print_json(planned.to_dict() | bounds | ({"file": str(output)} if output else {}))
     else:
         print_certificate(planned.plan.certificate)
 
 
-def _compared(duration: float, bound: float, speed_factor: float) -> str:
-    """Return one line that compares a flight's duration with the lower bound at the same speed factor, s."""
+def _bounds(planned: "PlannedFlight", steps: Steps) -> dict[str, float | None]:
+    """Return the bounds on the flight's duration, s, for JSON, and compare with them in steps of their own."""
+    duration, speed_factor = planned.duration, planned.plan.speed_factor
+    with steps.step("bound") as results:
+        along_path = planned.lower_bound()
+        results.append(_compared(duration, along_path, speed_factor, "no flight along it"))
+    point_mass = None
+    if planned.fastest:
+        with steps.step("point mass") as results:
+            point_mass = planned.point_mass_bound()
+            if point_mass is None:
+                results.append("not computed")
+            else:
+                results.append(_compared(duration, point_mass, speed_factor, "no vehicle"))
+    return {"lower_bound": along_path, "point_mass_bound": point_mass}
+
+
+def _compared(duration: float, bound: float, speed_factor: float, who: str) -> str:
+    """Return one line that compares a flight's duration with a bound at the same speed factor, s."""
     at_speed = f" at {speed_factor:g} of full speed" if speed_factor < 1.0 else ""
-    return f"{shown(100 * (duration / bound - 1.0), '.1f')} % above {bound:.2f} s, which no flight{at_speed} beats"
+    return f"{shown(100 * (duration / bound - 1.0), '.1f')} % above {bound:.2f} s, which {who}{at_speed} beats"
 
 
 def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:

@@ -52,7 +52,7 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 def _without_walls(source: Path, limits: "Limits", steps: "Steps") -> "Plan":
     """Plan a path file within the limits of motion alone. Raises InfeasibleError if no profile keeps them."""
     from cfplan.geometry.path_file import load_path_file
-    from cfplan.planning.fastest_path import chosen_path
+    from cfplan.planning.path.choice import chosen_path
     from cfplan.planning.plan import plan
 
     everywhere = replace(limits.space, low=(-FAR, -FAR, -FAR), high=(FAR, FAR, FAR))

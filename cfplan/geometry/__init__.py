@@ -5,11 +5,13 @@ __all__ = [
     "continued",
     "guides",
     "min_snap",
+    "min_snap_gradient",
     "path",
     "path_families",
     "path_file",
     "polynomial_csv",
     "polynomials",
     "random_paths",
+    "waypoints",
     "yaw",
 ]

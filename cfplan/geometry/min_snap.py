@@ -33,8 +33,8 @@ def _snap_energy() -> NDArray:
     return np.outer(fourth, fourth) / exponent
 
 
-_HERMITE = hermite(4)
-_ENERGY = _HERMITE.T @ _snap_energy() @ _HERMITE
+HERMITE = hermite(4)  # values at the ends of [0, 1] to coefficients
+ENERGY = HERMITE.T @ _snap_energy() @ HERMITE  # the quadratic form in those values
 
 
 def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0, times: ArrayLike | None = None) -> Path:
@@ -49,6 +49,11 @@ def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0, times: ArrayLi
     """
     points, spans = _checked(waypoints, nominal_speed, MIN_SPACING)
     times = spans if times is None else check_times(points, times)
+    return least_snap(points, times)
+
+
+def least_snap(points: NDArray, times: NDArray) -> Path:
+    """Return what min_snap() does of points, (K, 3) m, and times, (K-1,) s, that need no checks."""
     return rest_path(times, pieces_through(points, times, start=REST, rest_end=True))
 
 
@@ -152,28 +157,52 @@ def pieces_through(points: NDArray, times: NDArray, start: NDArray | None, rest_
     Segment i goes from points[i] to points[i + 1], (K, 3) m, in times[i], s. `start`, (3, 3), is γ', γ'', γ''' at the
     first point, None where they are free; the end rests or is free.
     """
+    return np.asarray(_pieces(derivatives_at(points, times, start, rest_end), points, times, HERMITE))
+
+
+def derivatives_at(points: NDArray, times: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
+    """Return γ', γ'', γ''' with the least snap at each point, (K, 3, 3); see pieces_through()."""
     derivatives = np.zeros((len(points), 3, 3))
     if start is not None:
         derivatives[0] = start
-    first, last = 0 if start is None else 1, len(points) - 1 if rest_end else len(points)
-    if last > first and not _find_derivatives(derivatives, points, times, first, last, _ENERGY):
-        far = int(np.argmax(times))
-        raise InputError(
-            f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
-            f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
-            where=f"waypoint {far + 2}",
-            hint="correct the coordinate that slipped, or add points between",
-        )
-    return np.asarray(_pieces(derivatives, points, times, _HERMITE))
+    first, last = _unknown(points, start, rest_end)
+    if last > first:
+        matrix, force = _equations(derivatives, points, times, first, last, ENERGY)
+        solution, definite = _solve_scaled(matrix, force)
+        if not definite:
+            far = int(np.argmax(times))
+            raise InputError(
+                f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
+                f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
+                where=f"waypoint {far + 2}",
+                hint="correct the coordinate that slipped, or add points between",
+            )
+        derivatives[first:last] = solution.reshape(-1, 3, 3)
+    return derivatives
+
+
+def solve_adjoint(points: NDArray, times: NDArray, right: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
+    """Return what the equations of derivatives_at() give for another right side, (K, 3, 3); 0 where they are given."""
+    result = np.zeros((len(points), 3, 3))
+    first, last = _unknown(points, start, rest_end)
+    if last > first:
+        matrix, _ = _equations(result, points, times, first, last, ENERGY)
+        result[first:last] = _solve_scaled(matrix, right[first:last].reshape(-1, 3))[0].reshape(-1, 3, 3)
+    return result
+
+
+def _unknown(points: NDArray, start: NDArray | None, rest_end: bool) -> tuple[int, int]:
+    """Return from which point on, and before which, derivatives are to be found."""
+    return 0 if start is None else 1, len(points) - 1 if rest_end else len(points)
 
 
 @njit(error_model="numpy")
-def _find_derivatives(
+def _equations(
     derivatives: NDArray, points: NDArray, times: NDArray, first: int, last: int, unit_energy: NDArray
-) -> bool:
-    """Write γ', γ'', γ''' with the least snap, (K, 3, 3), at waypoints from `first` on, before `last`; others stay.
+) -> tuple[NDArray, NDArray]:
+    """Return the banded matrix and the right sides of the equations of least snap.
 
-    Return whether the equations could be solved.
+    Unknown are γ', γ'', γ''' at waypoints from `first` on, before `last`; elsewhere `derivatives`, (K, 3, 3), has them.
     """
     size = 3 * (last - first)
     matrix, force = np.zeros((size, 6)), np.zeros((size, 3))
@@ -204,11 +233,7 @@ def _find_derivatives(
                     force[left + a, axis] -= unit_energy[a + 1, 4] * moved
                 if right_free:
                     force[right + a, axis] -= unit_energy[a + 5, 4] * moved
-    solution, definite = _solve_scaled(matrix, force)
-    for n in range(size):
-        for axis in range(3):
-            derivatives[first + n // 3, n % 3, axis] = solution[n, axis]
-    return definite
+    return matrix, force
 
 
 @njit(error_model="numpy")

@@ -1,15 +1,24 @@
 """Path files, path.yaml: which curve to fly, where in the room, with which yaw.
 
 name: figure eight
-waypoints: [[0, 0, 1], [1, 1, 1], …]    # or  points: file.csv  (waypoints, x, y, z a row)
+waypoints: [[0, 0, 1], [1, 1, 1], …]    # see below; or  points: file.csv  (waypoints, x, y, z a row)
                                         # or  curve: file.csv  (samples of a curve, x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
                                         # or  samples: file.csv  (t, x, y, z a row; the way is kept, the timing not)
-shape: fastest                          # of waypoints: segment times are chosen when planning; min-snap if left out
+shape: fastest                          # of waypoints: the path is chosen when planning; or min-snap
+times: centripetal                      # of the segments of shape min-snap; or length
+corridor: 0.3                           # m that the fastest path may lead away from the straight lines, if given
 yaw: {mode: fixed, angle_deg: 30}       # or  yaw: tangent,  yaw: free;  fixed at 0 if left out
 laps: 3                                 # of a closed path, flown through without a stop
 speed: 0.5                              # speed factor: 1 is as fast as the limits allow
 place: {x: 0, y: 0, z: 0, yaw_deg: 90}  # turned about z through the origin, then moved; a fixed yaw turns too
+
+The fastest path may pass a waypoint within a distance, m, or through a gate, in the direction of its yaw:
+
+waypoints:
+  - [0, 0, 1]
+  - {at: [1, 0, 1], within: 0.1}
+  - {gate: [2, 1, 1], yaw_deg: 90, width: 0.6, height: 0.6}
 """
 
 import math
@@ -17,11 +26,11 @@ import pathlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from cfplan.errors import InputError
 from cfplan.files.text import read_table, read_timed_table
@@ -30,6 +39,7 @@ from cfplan.geometry.min_snap import (
     MIN_DENSE_SPACING,
     MIN_SPACING,
     REMOVE_HINT,
+    centripetal_times,
     check_points,
     min_snap,
     smooth_through,
@@ -37,19 +47,28 @@ from cfplan.geometry.min_snap import (
 from cfplan.geometry.path import Path, rotation_about_z
 from cfplan.geometry.polynomial_csv import read_polynomials
 from cfplan.geometry.timed_samples import timed_samples
+from cfplan.geometry.waypoints import Gate, Region, Within
 from cfplan.geometry.yaw import YawMode
 
 _LEAST_SAMPLED = 4  # points that a smooth path with free ends needs
 _MANY_WAYPOINTS = 50  # rows of `points`: more are rather samples of a curve
 _MAX_POINTS = 50_000  # over all laps
+MOST_WITHIN = 100.0  # m, of what surrounds a waypoint or a line
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
 
 class PathShape(StrEnum):
     """Which curve leads through waypoints."""
 
-    MIN_SNAP = "min-snap"  # with segment times like the straight lengths
-    FASTEST = "fastest"  # with segment times chosen for the shortest flight, see planning/fastest_path.py
+    FASTEST = "fastest"  # the one that is flown soonest, see planning/path/choice.py
+    MIN_SNAP = "min-snap"  # the one of least snap for given times of the segments
+
+
+class SegmentTimes(StrEnum):
+    """Times of the segments of a path of least snap."""
+
+    CENTRIPETAL = "centripetal"  # like the roots of the straight lengths
+    LENGTH = "length"  # like the straight lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +76,7 @@ class PathFile:
     """A path file's content, checked and placed in the room."""
 
     name: str
-    path: Path  # in the frame of the room; of min-snap shape until planning chooses another
+    path: Path  # in the frame of the room; of least snap until planning chooses another
     yaw: YawMode
     yaw_angle: float  # rad, in the frame of the room, in mode fixed; otherwise 0
     speed: float  # speed factor in (0, 1]; 1 is not slowed
@@ -65,7 +84,9 @@ class PathFile:
     waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
     losses: tuple[str, ...] = ()  # what the path does not keep or mistakes in what was given, a few words each
-    shape: PathShape = PathShape.MIN_SNAP
+    shape: PathShape | None = None  # of the path through waypoints; None where the path was given
+    regions: tuple[Region, ...] = ()  # where each waypoint may be passed, all laps; empty where the path was given
+    corridor: float | None = None  # m, how far the path may lead from the straight lines between waypoints
 
 
 class _Yaw(BaseModel):
@@ -99,16 +120,57 @@ def _share(value: Any) -> Any:
     return value
 
 
+class _Waypoint(BaseModel):
+    """A waypoint as files have it: a list of numbers, or keys with values."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    at: list[float] | None = None
+    within: float | None = Field(default=None, gt=0.0, le=MOST_WITHIN)
+    gate: list[float] | None = None
+    yaw_deg: float | None = Field(default=None, ge=-360.0, le=360.0)
+    width: float | None = Field(default=None, gt=0.0, le=MOST_WITHIN)
+    height: float | None = Field(default=None, gt=0.0, le=MOST_WITHIN)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_list(cls, value: Any) -> Any:
+        return {"at": value} if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        of_gate = [key for key in ("yaw_deg", "width", "height") if getattr(self, key) is not None]
+        if self.gate is None and of_gate:
+            raise ValueError(f"{of_gate[0]} is of a gate{HINT}write `gate: [x, y, z]` instead of `at`")
+        if (self.at is None) == (self.gate is None):
+            raise ValueError(f"a waypoint is either `at` or a `gate`{HINT}write [x, y, z], or {{gate: [x, y, z], …}}")
+        if self.gate is not None and (self.within is not None or len(of_gate) < 3):
+            raise ValueError(f"a gate has yaw_deg, width and height, and nothing else{HINT}give all three")
+        return self
+
+    @property
+    def position(self) -> list[float]:
+        return (self.gate if self.at is None else self.at) or []
+
+    @property
+    def region(self) -> Region:
+        if self.gate is not None:
+            return Gate(math.radians(self.yaw_deg or 0.0), self.width or 0.0, self.height or 0.0)
+        return None if self.within is None else Within(self.within)
+
+
 class _Content(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
-    waypoints: list[list[float]] | None = None
+    waypoints: list[_Waypoint] | None = None
     points: str | None = None
     curve: str | None = None
     polynomials: str | None = None
     samples: str | None = None
-    shape: PathShape = PathShape.MIN_SNAP
+    shape: PathShape = PathShape.FASTEST
+    times: SegmentTimes = SegmentTimes.CENTRIPETAL
+    corridor: float | None = Field(default=None, gt=0.0, le=MOST_WITHIN)
     yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
     laps: int = Field(default=1, ge=1, le=1000)
     speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
@@ -124,14 +186,11 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content)
     given = _source(content, places)
-    if "shape" in content.model_fields_set and given not in ("waypoints", "points"):
-        raise InputError(
-            f"shape is for waypoints and points only: `{given}` is flown as it is given",
-            where=places.where_key("shape"),
-            hint="leave shape out, or give waypoints or points",
-        )
+    through = given in ("waypoints", "points")
+    _check_choice(content, places, given, through)
     path, waypoints, *losses = _SOURCES[given](content, places)
-    path.check(where=places.where(given))
+    if not through:  # between waypoints a path may turn back: it stops there for no longer than a moment
+        path.check(where=places.where(given))
 
     if content.yaw.angle_deg and content.yaw.mode is not YawMode.FIXED:
         raise InputError(
@@ -153,8 +212,52 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         waypoints=waypoints @ rotation_about_z(turn).T + offset,
         source=file,
         losses=tuple(losses),
-        shape=content.shape,
+        shape=content.shape if through else None,
+        regions=_regions(content, len(waypoints), turn) if through else (),
+        corridor=content.corridor,
     )
+
+
+def _check_choice(content: _Content, places: Places, given: str, through: bool) -> None:
+    """Raise InputError where a file says how to choose a path that it gives, or that it has otherwise chosen."""
+    for key in ("shape", "times", "corridor"):
+        if key in content.model_fields_set and not through:
+            raise InputError(
+                f"{key} is for waypoints and points only: `{given}` is flown as it is given",
+                where=places.where_key(key),
+                hint=f"leave {key} out, or give waypoints or points",
+            )
+    fastest = content.shape is PathShape.FASTEST
+    if "times" in content.model_fields_set and fastest:
+        raise InputError(
+            "times are for shape: min-snap only: those of the fastest path are chosen",
+            where=places.where_key("times"),
+            hint="leave times out, or write `shape: min-snap`",
+        )
+    if fastest:
+        return
+    if content.corridor is not None:
+        raise InputError(
+            "a corridor is for shape: fastest only",
+            where=places.where_key("corridor"),
+            hint="leave shape or corridor out",
+        )
+    for index, waypoint in enumerate(content.waypoints or []):
+        if waypoint.region is not None:
+            raise InputError(
+                "gates and `within` are for shape: fastest only",
+                where=places.where("waypoints", index),
+                hint="leave shape out, or write the waypoint as [x, y, z]",
+            )
+
+
+def _regions(content: _Content, count: int, turn: float) -> tuple[Region, ...]:
+    """Return the region of each waypoint of all laps, `count`, in the frame of the room."""
+    if content.waypoints is None:
+        return (None,) * count
+    of_file = [waypoint.region and waypoint.region.turned(turn) for waypoint in content.waypoints]
+    lap = [*of_file[1:-1], of_file[0]]
+    return (*of_file[:1], *lap * content.laps) if content.laps > 1 else tuple(of_file)
 
 
 def path_through(points: ArrayLike, name: str = "points") -> PathFile:
@@ -172,9 +275,10 @@ def path_through(points: ArrayLike, name: str = "points") -> PathFile:
     if len(rows) > _MAX_POINTS:
         raise InputError(f"more than {_MAX_POINTS} points", where=name, hint="give fewer points")
     check_points(rows, MIN_SPACING, lambda index: f"{name}, row {index + 1}")
-    path = min_snap(rows)
-    path.check(where=name)
-    return PathFile(name, path, YawMode.FIXED, 0.0, 1.0, 1, rows, pathlib.Path(name))
+    path = min_snap(rows, times=_nominal(rows))
+    return PathFile(
+        name, path, YawMode.FIXED, 0.0, 1.0, 1, rows, pathlib.Path(name), (), PathShape.FASTEST, (None,) * len(rows)
+    )
 
 
 def _source(content: _Content, places: Places) -> str:
@@ -196,7 +300,7 @@ def _source(content: _Content, places: Places) -> str:
 
 
 def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
-    rows = content.waypoints or []
+    rows = [waypoint.position for waypoint in content.waypoints or []]
     for index, row in enumerate(rows):
         if len(row) != 3:
             raise InputError(
@@ -213,7 +317,7 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
         )
     check_points(points, MIN_SPACING, lambda index: places.where("waypoints", index))
     points = _repeated(points, content.laps, places)
-    return _path_with(min_snap, points, places.where("waypoints")), points
+    return _path_with(_least_snap(content), points, places.where("waypoints")), points
 
 
 def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
@@ -221,7 +325,7 @@ def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
     rows = _read_points(places, content.points, MIN_SPACING)
     points = _repeated(rows, content.laps, places)
     words = (f"{len(rows)} rows are waypoints here: write `curve: {content.points}` if they are samples of a curve",)
-    path = _path_with(min_snap, points, str(_beside(places, content.points)))
+    path = _path_with(_least_snap(content), points, str(_beside(places, content.points)))
     return path, points, *(words if len(rows) >= _MANY_WAYPOINTS else ())
 
 
@@ -235,6 +339,19 @@ def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
         )
     points = _repeated(points, content.laps, places)
     return _path_with(smooth_through, points, str(_beside(places, content.curve))), points
+
+
+def _least_snap(content: _Content) -> Callable[[NDArray], Path]:
+    """Return what lays a path of least snap through points, with the segment times that the file says."""
+    if content.times is SegmentTimes.LENGTH:
+        return min_snap
+    return lambda points: min_snap(points, times=_nominal(points))
+
+
+def _nominal(points: NDArray) -> NDArray:
+    """Return centripetal times, (K-1,) s, in which points, (K, 3) m, are passed at 1 m/s in the mean."""
+    times = centripetal_times(points)
+    return times * (np.linalg.norm(np.diff(points, axis=0), axis=1).sum() / times.sum())
 
 
 def _read_points(places: Places, name: str | None, spacing: float) -> NDArray:

@@ -3,8 +3,8 @@
 __all__ = [
     "active_limits",
     "continuation",
-    "fastest_path",
     "figure",
+    "path",
     "plan",
     "plan_file",
     "plan_result",

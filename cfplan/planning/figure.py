@@ -12,6 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.files.whole import check_new_file, write_whole
+from cfplan.geometry.path import Path as CurvePath
+from cfplan.geometry.path_file import PathFile
+from cfplan.geometry.waypoints import Gate, Within
 from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, active_limits, on_white
 from cfplan.planning.plan_result import Plan
 
@@ -40,8 +43,14 @@ def check_figure_file(file: Path, *, overwrite: bool) -> None:
     check_new_file(file, *SUFFIXES, overwrite=overwrite)
 
 
-def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
-    """Return the figure of a plan, with what was flown over it."""
+def draw_plan(
+    plan: Plan,
+    name: str,
+    flown: Flown | None = None,
+    path_file: PathFile | None = None,
+    least_snap: CurvePath | None = None,
+) -> "Figure":
+    """Return the figure of a plan, with what was flown over it, its waypoints, and the path that it was chosen over."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -53,6 +62,11 @@ def draw_plan(plan: Plan, name: str, flown: Flown | None = None) -> "Figure":
     views, curves = np.asarray(figure.subfigures(1, 2, width_ratios=(1.25, 1.0))).tolist()
     above, aside = views.subplots(2, 1, height_ratios=(size[1 - wide] + 0.6, size[2] + 0.6))
     for axes, (across, up) in ((above, (wide, 1 - wide)), (aside, (wide, 2))):
+        if least_snap is not None:
+            s = np.linspace(0.0, least_snap.end, 1000)
+            axes.plot(*least_snap(s)[:, (across, up)].T, color="0.6", lw=1.0, ls=":", label="min-snap")
+        if path_file is not None and path_file.regions:
+            _draw_waypoints(axes, path_file, across, up)
         _draw_view(axes, plan, active, flown, across, up)
     above.set_title("from above", loc="left", fontsize=9)
     aside.set_title("from the side", loc="left", fontsize=9)
@@ -111,6 +125,20 @@ def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | No
     axes.plot(flown.position[:, across], flown.position[:, up], color=FLOWN, lw=0.8, label="flown")
     if up != 2:  # the largest deviation, magnified, from above
         _magnify(axes, active, flown, across, up)
+
+
+def _draw_waypoints(axes: "Axes", path_file: PathFile, across: int, up: int) -> None:
+    """Draw waypoints, with the distances within which they are passed and the openings of gates, along two axes."""
+    from matplotlib.patches import Circle
+
+    axes.plot(*path_file.waypoints[:, (across, up)].T, "+", color="0.2", ms=7, label="waypoints")
+    for point, region in zip(path_file.waypoints, path_file.regions, strict=True):
+        if isinstance(region, Within):
+            axes.add_patch(Circle((point[across], point[up]), region.radius, fill=False, ec="0.2", lw=0.7))
+        elif isinstance(region, Gate):
+            sides, top = region.half_axes(0.0)
+            corners = point + np.array([sides + top, sides - top, -sides - top, top - sides, sides + top])
+            axes.plot(*corners[:, (across, up)].T, color="0.2", lw=1.4)
 
 
 def draw_path(axes: "Axes", active: ActiveLimits, *along: int) -> None:

@@ -16,7 +16,7 @@ from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.random_paths import perturbed
-from cfplan.planning.fastest_path import chosen_path
+from cfplan.planning.path.choice import chosen_path
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO

@@ -13,8 +13,9 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import PathFile, load_path_file
 from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
+from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planners.task import PlanningTask
-from cfplan.planning.fastest_path import chosen_path
+from cfplan.planning.path.choice import FastestPath, chosen_path
 from cfplan.planning.plan import default_budget, plan
 from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.planning.plan_result import Plan
@@ -57,6 +58,8 @@ class PlannedFlight:
     limits: Limits
     link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
     was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
+    path_file: PathFile | None = None  # what was planned, where that is known
+    fastest: FastestPath | None = None  # what choosing its path was worth, where it was chosen
 
     def __repr__(self) -> str:
         verdict = "certified" if self.certificate.passed else "not certified"
@@ -83,7 +86,9 @@ class PlannedFlight:
         """Return the plan drawn in its room, with what holds it back: a matplotlib figure, for `.savefig(file)`."""
         from cfplan.planning.figure import draw_plan
 
-        return draw_plan(self.plan, self.name)
+        return draw_plan(
+            self.plan, self.name, path_file=self.path_file, least_snap=self.fastest and self.fastest.least_snap
+        )
 
     def save_figure(self, file: Path, *, overwrite: bool = False) -> None:
         """Write the drawing as .png, .pdf or .svg. Raises InputError where it cannot."""
@@ -95,6 +100,16 @@ class PlannedFlight:
         """Return the time, s, that no flight along the path beats at the plan's speed factor; takes up to a second."""
         plan = self.plan
         return lower_bound(PlanningTask(plan.path, plan.airframe, self.limits.plan)) / plan.speed_factor
+
+    def point_mass_bound(self) -> float | None:
+        """Return the time, s, of a point mass with these limits on speed and acceleration through the waypoints.
+
+        None where the path was not chosen, where there are too many waypoints, and where none is found.
+        """
+        if self.path_file is None or self.fastest is None:
+            return None
+        time = point_mass_time(self.path_file.waypoints, self.limits.plan, self.path_file.regions)
+        return None if time is None else time / self.plan.speed_factor
 
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the plan and its certificate, for JSON."""
@@ -162,10 +177,10 @@ def plan_flight(
     if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
         with step(on_step, "slowing") as results:
             results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
-        return PlannedFlight(path_file.name, planned, limits)
+        return PlannedFlight(path_file.name, planned, limits, path_file=path_file, fastest=fastest)
     compile_from_here()  # without, simulating takes minutes
     planned, link_loss = give_way(planned, on_step, Deadline.after(left))
-    return PlannedFlight(path_file.name, planned, limits, link_loss)
+    return PlannedFlight(path_file.name, planned, limits, link_loss, path_file=path_file, fastest=fastest)
 
 
 def give_way(

@@ -27,10 +27,17 @@ BAD_PATHS = {
     "a waypoint outside the space": ("waypoints: [[0, 0, 1], [3, 0, 1]]\n", 3),
     "a waypoint within the margin": ("waypoints: [[0, 0, 1], [2.15, 0, 1]]\n", 3),
     "a path that leaves between its waypoints": (
-        "waypoints: [[-2, 0, 1], [2.04, 3.7, 1], [2.04, -3.7, 1], [-2, 0, 1]]\n", 3),
+        "waypoints: [[-2, 0, 1], [2.04, 3.7, 1], [2.04, -3.7, 1], [-2, 0, 1]]\nshape: min-snap\n", 3),
     "no such file of points": ("points: nowhere.csv\n", 2),
     "millimetres": ("waypoints: [[0, -1500, 1000], [300, 1500, 1000]]\n", 3),
     "an unknown shape": (LINE + "shape: fast\n", 2),
+    "an unknown timing": (LINE + "shape: min-snap\ntimes: equal\n", 2),
+    "times of the fastest path": (LINE + "times: length\n", 2),
+    "a waypoint that is no list": ("waypoints:\n  - [0, 0, 1]\n  - {within: 0.2}\n", 2),
+    "half a gate": ("waypoints:\n  - [0, 0, 1]\n  - {gate: [1, 0, 1], width: 0.8}\n", 2),
+    "a gate narrower than the margin": (
+        "waypoints:\n  - [0, 0, 1]\n  - {gate: [1, 0, 1], yaw_deg: 0, width: 0.3, height: 1}\n  - [2, 0, 1]\n", 3),
+    "a corridor of a curve": ("curve: line.csv\ncorridor: 0.2\n", 2),
     "a shape of a curve": ("curve: line.csv\nshape: fastest\n", 2),
     "a path under the floor": ("waypoints: [[0, 0, 1], [1, 0, -0.1]]\n", 3),
     "a yaw without its mode": (LINE + "yaw: 90\n", 2),

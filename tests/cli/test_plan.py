@@ -22,7 +22,7 @@ def test_at_half_the_speed_the_flight_and_its_bound_are_twice_as_long(planned):
     for speed in ("1", "0.5"):
         out = planned("--speed", speed).out
         (flight,) = re.findall(r"plan .* ms  (\d+\.\d+) s of flight", out)
-        (more, bound) = re.findall(r"bound .* ms  (\d+\.\d) % above (\d+\.\d+) s, which no flight", out)[0]
+        (more, bound) = re.findall(r"bound .* ms  (\d+\.\d) % above (\d+\.\d+) s, which no flight along it", out)[0]
         assert float(flight) / float(bound) - 1.0 == pytest.approx(float(more) / 100, abs=0.004)
         shares.append(float(more))
         assert ("at 0.5 of full speed" in out) == (speed == "0.5")
@@ -42,14 +42,14 @@ def test_the_bound_is_in_the_document(planned):
 
 def test_the_choice_of_a_fastest_path_is_told_and_bench_and_robustness_make_the_same(cfplan, path_file, safety_file):
     rectangle = "waypoints: [[-1.5, 0, 1], [1.5, 0, 1], [1.5, 0.3, 1], [-1.5, 0.3, 1], [-1.5, 0, 1]]"
-    files = path_file(f"{rectangle}\nshape: fastest\n"), "--safety", safety_file()
+    files = path_file(f"{rectangle}\n"), "--safety", safety_file()
     chosen, min_snap = {}, {}
     for speed in ("1", "0.5"):
         out = cfplan("plan", *files, "--speed", speed).out
-        chosen[speed], min_snap[speed] = re.findall(r" plan .* fastest path: (\S+) s instead of (\S+) s", out)[0]
-        (flight,) = re.findall(r" plan .* ms  (\d+\.\d+) s of flight", out)
-        assert flight == chosen[speed]
-        assert float(flight) < 0.95 * float(min_snap[speed])
+        chosen[speed], min_snap[speed] = re.findall(r" plan .* ms  (\S+) s of flight.* (\S+) s along min-snap", out)[0]
+        assert float(chosen[speed]) < 0.95 * float(min_snap[speed])
+        ((above, least),) = re.findall(r"point mass .* ms  (\S+) % above (\S+) s, which no vehicle", out)
+        assert float(chosen[speed]) / float(least) - 1.0 == pytest.approx(float(above) / 100, abs=0.004)
     assert float(chosen["0.5"]) == pytest.approx(2 * float(chosen["1"]), abs=0.02)
     (benched,) = cfplan("bench", *files, "--planner", "learned", "--json").json["plans"]
     assert f"{benched['duration']:.2f}" == chosen["1"]

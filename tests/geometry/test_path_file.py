@@ -8,8 +8,9 @@ import pytest
 import yaml
 
 from cfplan.errors import InputError
-from cfplan.geometry.min_snap import min_snap, smooth_through
+from cfplan.geometry.min_snap import centripetal_times, min_snap, smooth_through
 from cfplan.geometry.path_file import PathFile, PathShape, load_path_file
+from cfplan.geometry.waypoints import Gate, Within
 from cfplan.geometry.yaw import YawMode
 
 FLIGHTS = sorted((pathlib.Path(__file__).parents[2] / "flights").glob("*.yaml"))
@@ -35,8 +36,8 @@ def test_waypoints_alone_are_enough(load, tmp_path):
     assert (flight.yaw, flight.yaw_angle, flight.speed, flight.laps) == (YawMode.FIXED, 0.0, 1.0, 1)
     assert flight.source == tmp_path / "path.yaml"
     np.testing.assert_array_equal(flight.waypoints, CORNERS)
-    expected = min_snap(CORNERS)
-    np.testing.assert_array_equal(flight.path([0.3, 2.0]), expected([0.3, 2.0]))
+    assert flight.shape is PathShape.FASTEST
+    np.testing.assert_allclose(flight.path(flight.path.breaks), CORNERS, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -77,10 +78,28 @@ def test_a_fixed_yaw_turns_with_the_place_and_stays_within_half_a_turn(load):
     assert flight.yaw_angle == pytest.approx(math.radians(-170))
 
 
-def test_the_shape_is_min_snap_unless_the_file_says_otherwise(load):
-    assert load({"waypoints": CORNERS}).shape is load({"waypoints": CORNERS, "shape": "min-snap"}).shape
-    assert load({"waypoints": CORNERS}).shape is PathShape.MIN_SNAP
-    assert load({"waypoints": CORNERS, "shape": "fastest"}).shape is PathShape.FASTEST
+def test_a_path_of_least_snap_has_centripetal_times_or_those_of_the_lengths(load):
+    times = centripetal_times(CORNERS)
+    for given, expected in (({}, times), ({"times": "centripetal"}, times), ({"times": "length"}, None)):
+        flight = load({"waypoints": CORNERS, "shape": "min-snap", **given})
+        assert flight.shape is PathShape.MIN_SNAP
+        path = min_snap(CORNERS, times=expected)
+        share = np.linspace(0.0, 1.0, 7)
+        np.testing.assert_allclose(flight.path(share * flight.path.end), path(share * path.end), atol=1e-12)
+
+
+def test_waypoints_are_points_regions_and_gates_that_turn_with_the_place(load):
+    gate = {"gate": [1, 1, 1], "yaw_deg": 45, "width": 0.8, "height": 0.6}
+    flight = load({
+        "waypoints": [[0, 0, 1], {"at": [1, 0, 1], "within": 0.2}, gate, [0, 0, 1]], "laps": 2, "place": {"yaw_deg": 90}
+    })  # fmt: skip
+    turned = Gate(pytest.approx(math.radians(135.0)), 0.8, 0.6)
+    assert flight.regions == (None, Within(0.2), turned, None, Within(0.2), turned, None)
+    np.testing.assert_allclose(flight.waypoints[2], [-1, 1, 1], atol=1e-12)
+
+
+def test_waypoints_may_turn_back(load):
+    assert len(load({"waypoints": [[0, 0, 1], [1, 0, 1], [0, 0, 1]]}).waypoints) == 3
 
 
 @pytest.mark.parametrize("separator", [",", ";", " ", "\t", ", "])
@@ -106,7 +125,9 @@ def circle(count: int) -> np.ndarray:
 def test_the_key_says_whether_rows_are_waypoints_or_samples_and_no_count_does(load, count):
     rows = circle(count)
     waypoints, samples = load("points: rows.csv\n", rows=table(rows)), load("curve: rows.csv\n")
-    np.testing.assert_array_equal(waypoints.path.coefficients, min_snap(rows).coefficients)
+    np.testing.assert_allclose(waypoints.path(waypoints.path.breaks), rows, atol=1e-9)
+    assert waypoints.shape is PathShape.FASTEST
+    assert samples.shape is None
     np.testing.assert_array_equal(samples.path.coefficients, smooth_through(rows).coefficients)
     assert waypoints.losses == samples.losses == ()
 
@@ -152,7 +173,20 @@ def test_hundreds_of_samples_keep_their_shape(load):
         ("waypoints:\n- [0,0,1]\n- [1,0,1]\n- [1,0.005,1]\n", ":4:3: waypoints 2 and 3 are 0.0050 m apart"),
         ("waypoints:\n- [0,0,1]\n- [1,.nan,1]\n", ":3:6: a finite number is needed, not .nan"),
         ("waypoints:\n- [0,0,1]\n- [1,1e30,1]\n", ":3:3: coordinates must be numbers within"),
-        ("waypoints: [[0,0,1],[1,0,1],[0,0,1]]\n", ":1:12: the path stops between its ends"),
+        ("curve: back.csv\n", "the path stops between its ends"),
+        ("waypoints: [[0,0,1],[1,0,1]]\ntimes: length\n", ":2:1: times are for shape: min-snap only"),
+        ("waypoints: [[0,0,1],[1,0,1]]\nshape: min-snap\ncorridor: 1\n", ":3:1: a corridor is for shape: fastest"),
+        ("curve: one.csv\ncorridor: 0.2\n", ":2:1: corridor is for waypoints and points only"),
+        ("waypoints: [[0,0,1],[1,0,1]]\ncorridor: 0\n", ":2:11: corridor should be greater than 0"),
+        ("waypoints:\n- [0,0,1]\n- {at: [1,0,1], within: 0}\n", ":3:25: waypoints item 2.within should be greater"),
+        ("waypoints:\n- [0,0,1]\n- {within: 0.2}\n", ":3:3: waypoints item 2: a waypoint is either `at` or"),
+        ("waypoints:\n- [0,0,1]\n- {at: [1,0,1], width: 1}\n", ":3:3: waypoints item 2: width is of a gate"),
+        ("waypoints:\n- [0,0,1]\n- {gate: [1,0,1], width: 1, height: 1}\n", ":3:3: waypoints item 2: a gate has"),
+        (
+            "waypoints:\n- [0,0,1]\n- {gate: [1,0], yaw_deg: 0, width: 1, height: 1}\n",
+            ":3:3: waypoint 2 has 2 numbers, not x, y, z",
+        ),
+        ("shape: min-snap\nwaypoints:\n- [0,0,1]\n- {at: [1,0,1], within: 0.1}\n", ":4:3: gates and `within` are"),
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 2\n", ":2:7: 2 laps need a closed path, but the last point is 1.000 m"),
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 0\n", ":2:7: laps should be greater than or equal to 1, not 0"),
         ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 0\n", ":2:8: speed should be greater than 0, not 0"),
@@ -162,9 +196,9 @@ def test_hundreds_of_samples_keep_their_shape(load):
         ("waypoints: [[0,0,1],[1,0,1]]\nyaws: free\n", ":2:1: unknown key 'yaws' (hint: did you mean 'yaw'?"),
         (
             "waypoints: [[0,0,1],[1,0,1]]\nshape: quick\n",
-            ":2:8: shape should be 'min-snap' or 'fastest', not \"quick\" (hint: ",
+            ":2:8: shape should be 'fastest' or 'min-snap', not \"quick\" (hint: ",
         ),
-        ("shape:\nwaypoints: [[0,0,1],[1,0,1]]\n", ":1:7: shape should be 'min-snap' or 'fastest'"),
+        ("shape:\nwaypoints: [[0,0,1],[1,0,1]]\n", ":1:7: shape should be 'fastest' or 'min-snap'"),
         (
             "curve: one.csv\nshape: fastest\n",
             ":2:1: shape is for waypoints and points only: `curve` is flown as it is given (hint: leave shape out",
@@ -184,9 +218,12 @@ def test_hundreds_of_samples_keep_their_shape(load):
             "curve: few.csv\n",
             "few.csv: a curve needs at least 4 samples, not 3 (hint: add rows x, y, z to the file, or",
         ),
-        ("points: slip.csv\n", "slip.csv, waypoint 4: from the point before it is 65533 m"),
         (
-            "waypoints: [[65534,0,1],[1,0,1],[1,1,1.2],[65534,0,1]]\n",
+            "points: slip.csv\nshape: min-snap\ntimes: length\n",
+            "slip.csv, waypoint 4: from the point before it is 65533 m",
+        ),
+        (
+            "waypoints: [[65534,0,1],[1,0,1],[1,1,1.2],[65534,0,1]]\nshape: min-snap\ntimes: length\n",
             ":1:12, waypoint 4: from the point before it is 65533 m",
         ),
         ("points: words.csv\n", "words.csv: no rows of numbers"),
@@ -202,6 +239,7 @@ def test_each_mistake_is_named_with_its_place(load, content, message):
             twice="0,0,1\n1,0,1\n\n1,0,1\n",
             few="0,0,1\n1,0,1\n1,1,1\n",
             words="x,y,z\n",
+            back="0,0,1\n0.5,0,1\n1,0,1\n0.5,0,1\n0,0,1\n",
             slip="65534,0,1\n1,0,1\n1,1,1.2\n65534,0,1\n",
         )
     assert message in str(caught.value)

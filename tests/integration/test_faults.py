@@ -11,6 +11,7 @@ from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase
+from cfplan.geometry.random_paths import random_waypoints
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.preparation.replan import replan
 from cfplan.preparation.stepped_planner import PlannerFault
@@ -23,6 +24,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
 from studies.faults import STUDY, Settings, fly_scenario, fly_stepped, judge, prepare_held
 from studies.random_faults import fly_random, prepare_missions, random_scenario, with_silence
+from studies.runner.limits import limits_for
 from studies.runner.study import Run
 
 REPOSITORY = Path(__file__).parents[2]
@@ -155,8 +157,14 @@ def test_the_quick_rows_are_rows_of_the_table():
 
 
 @pytest.fixture(scope="module")
-def missions():
-    return prepare_missions([LINE], 2)
+def missions(tmp_path_factory):
+    """The line, and a small path of least snap, along which faults once led out of the room."""
+    space = limits_for(LINE).space
+    box = np.array([np.array(space.low) + space.margin, np.array(space.high) - space.margin])
+    points = random_waypoints(2, box, (2, 3)).round(3).tolist()
+    small = tmp_path_factory.mktemp("small") / "small-2.yaml"
+    small.write_text(f"waypoints: {points}\nshape: min-snap\ntimes: length\n")
+    return prepare_missions([LINE, small])
 
 
 def test_a_flight_in_the_stepped_lab_repeats_to_the_last_bit(missions):

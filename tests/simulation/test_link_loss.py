@@ -225,7 +225,7 @@ def test_it_says_which_wall(limits):
 def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_it_ends_at_most(name, speed, limits):
     fast = replace(limits, plan=replace(limits.plan, speed=speed, acceleration=2.5 * speed))
     payloads = prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", fast).payloads
-    for within in (0.0, 0.4):
+    for within in (0.0, 0.45):
         all_of_them, found = link_loss_at_every_setpoint(payloads, fast), link_loss_near_walls(payloads, fast, within)
         assert found.worst == all_of_them.worst
         near = all_of_them.beyond > -within

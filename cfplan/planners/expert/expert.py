@@ -90,13 +90,13 @@ def can_begin(task: PlanningTask) -> bool:
         return False
     moves = task.start.h**0.5 if task.start else 0.0  # units of s a second
     intervals = math.ceil(BEGINNING * moves * task.nodes / task.path.end)
-    segment = _segment(task, min(max(intervals, LEAST_BEGINNING), task.nodes))
+    segment = segment_of(task, min(max(intervals, LEAST_BEGINNING), task.nodes))
     problem = build_problem(segment, task.yaw_angle)
     starts = (early_start(interval_of(segment, problem.coefficients)),)
     return not rejection_reason(solve(problem, problem.coefficients, starts, task.deadline), segment)
 
 
-def _segment(task: PlanningTask, nodes: int) -> Segment:
+def segment_of(task: PlanningTask, nodes: int) -> Segment:
     """Return the first so many intervals of a task; the end of less than all of them is free."""
     whole, step = nodes == task.nodes, task.path.end / task.nodes
     path = task.path if whole else task.path.part(0.0, nodes * step)
@@ -131,7 +131,7 @@ def _plan(
             attempt, problem, segment, restarts, task.deadline, enough
         )
 
-    whole = _segment(task, task.nodes)
+    whole = segment_of(task, task.nodes)
     joined = by_windows(whole, window, search)
     if isinstance(joined, str) and sum(window) < task.nodes and not task.deadline.passed:
         joined = by_windows(whole, WindowSize(task.nodes, 0), search)  # no motion continues from a joint of two windows

@@ -1,0 +1,88 @@
+"""How the flight time changes with the path.
+
+At an optimum the flight time changes with the data of its problem as the Lagrangian does while profile and multipliers
+stay (the envelope theorem). The path enters the Lagrangian by γ' to γ'''' at the problem's points alone: the kernels
+evaluate it there once for each of these twelve numbers moved a little. Where the limit on speed holds, γ' enters by the
+bound on h. What turns with the path, a yaw along it, is taken to stay; penalties count as time, as in the problem.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.geometry.path import Path
+from cfplan.planners.expert import point_constraints
+from cfplan.planners.expert.expert import segment_of
+from cfplan.planners.expert.kernel import kernels_at_hand
+from cfplan.planners.expert.problem import Problem, build_problem, interval_of
+from cfplan.planners.expert.search import Attempt, early_start, refining_starts, rejection_reason, solve
+from cfplan.planners.expert.transcription import OBJECTIVE_SCALE
+from cfplan.planners.task import PlanningTask
+from cfplan.vehicle.timing import duration_of
+
+_MOVED = 1e-6  # share of the largest value of a derivative of the path, by which it is moved
+_STILL = 1e-9  # |γ'|² below which the path stands still
+
+
+class Sensitivity(NamedTuple):
+    """The flight time along a path, and how it changes with the path."""
+
+    duration: float  # s, within about 1 %: limits hold at the points of the grid only
+    s: NDArray  # (P,) places along the path
+    by_path: NDArray  # (4, 3, P) s per unit of γ' to γ'''' at the places
+    coefficients: NDArray  # (N+3, 1 or 2) of the profile's splines
+
+
+def sensitivity(task: PlanningTask, near: NDArray | None = None) -> Sensitivity | None:
+    """Return how the flight time of a task changes with its path, by one search for the profile; None if it fails.
+
+    `near` are coefficients of a path almost the same, which save half of the iterations.
+    """
+    if task.refusal:
+        return None
+    segment = segment_of(task, task.nodes)
+    problem = build_problem(segment, task.yaw_angle)
+    interval = interval_of(segment, problem.coefficients)
+    tries = [(near, refining_starts(interval)[:1])] if near is not None else []
+    for coefficients, starts in [*tries, (problem.coefficients, (early_start(interval),))]:
+        attempt = solve(problem, coefficients, starts, task.deadline)
+        if not rejection_reason(attempt, segment):
+            duration = float(duration_of(segment.profile(attempt.coefficients)))
+            return Sensitivity(duration, *_by_path(problem, attempt, task.path), attempt.coefficients)
+    return None
+
+
+def _by_path(problem: Problem, attempt: Attempt, path: Path) -> tuple[NDArray, NDArray]:
+    """Return the places, (P,), where the Lagrangian depends on the path, and its derivatives there, (4, 3, P), in s."""
+    layout = problem.layout
+    of_points = len(layout.interval) * point_constraints.ROWS
+    multipliers = (attempt.multipliers.slacks[2] - attempt.multipliers.slacks[1]) / OBJECTIVE_SCALE
+    at_points = _by_point_data(problem, attempt, multipliers[:of_points])
+    speed_s = layout.speed_s * problem.step
+    tangent = path(speed_s, 1).T
+    held = np.where(np.isfinite(problem.highest), problem.highest * multipliers[of_points:][: len(speed_s)], 0.0)
+    by_speed = np.zeros((4, 3, len(speed_s)))
+    by_speed[0] = 2.0 * held * tangent / np.maximum((tangent**2).sum(axis=0), _STILL)
+    return np.append(layout.s * problem.step, speed_s), np.concatenate([at_points, by_speed], axis=-1)
+
+
+def _by_point_data(problem: Problem, attempt: Attempt, multipliers: NDArray) -> NDArray:
+    """Return how the Lagrangian changes with γ' to γ'''' at the points, (4, 3, P)."""
+    layout, free_yaw = problem.layout, problem.layout.shape.free_yaw
+    points = len(layout.interval)
+    local = [attempt.coefficients[layout.interval + k, 0] for k in range(4)]
+    if free_yaw:
+        local += [attempt.coefficients[layout.interval + k, 1] for k in range(3)]
+    moved = _MOVED * np.abs(problem.point_data[:12]).reshape(4, -1).max(axis=1).repeat(3)
+    data = np.repeat(problem.point_data[:, None], 13, axis=1)  # as it is, and with each of twelve rows moved
+    data[np.arange(12), np.arange(1, 13)] += moved[:, None]
+    kernels = kernels_at_hand()(
+        free_yaw, data.reshape(len(data), -1), problem.common, OBJECTIVE_SCALE * problem.penalties, 0
+    )
+    kernels.coefficients[:] = np.tile(local, 13)
+    rows, penalty = kernels.evaluate()
+    of_rows = (rows.reshape(-1, 13, points) * multipliers.reshape(-1, 1, points)).sum(axis=0)
+    lagrangian = of_rows + penalty.reshape(13, points) / OBJECTIVE_SCALE
+    by_data = (lagrangian[1:] - lagrangian[0]) / moved[:, None]
+    return by_data.reshape(4, 3, points) * problem.step ** np.arange(1.0, 5.0)[:, None, None]

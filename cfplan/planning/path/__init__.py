@@ -1,0 +1,3 @@
+"""The path through waypoints that is flown soonest."""
+
+__all__ = ["choice"]

@@ -1,0 +1,114 @@
+"""What is chosen of a path through waypoints: segment times, points between waypoints, and points within regions.
+
+All variables are free of bounds. A segment time is an exponential; where a point may move within a ball or a gate, the
+variables are mapped onto it by q / √(1 + q²) (after Wang et al., 2022). All laps share their variables.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.geometry.min_snap import least_snap
+from cfplan.geometry.waypoints import Gate, Region, Within
+
+TIME_UNIT = 0.3  # of the logarithm of a segment time, a variable's unit
+POINT_UNIT, LARGEST_POINT_UNIT = 0.15, 0.2  # of the distance to the nearer neighbour, and, m, at most: of a free point
+
+
+class Knots(NamedTuple):
+    """The times and points that a path of least snap is laid through."""
+
+    times: NDArray  # (M,) s
+    points: NDArray  # (M+1, 3) m
+    waypoint: NDArray  # (K,) which of the points are the waypoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChoiceVariables:
+    """The variables of a choice, x, (n,), and the way from them to times and points, and of gradients back."""
+
+    start: Knots  # where all variables but those of times are 0
+    axes: NDArray  # (P, 3, 3) m, rows: along which each point of a lap may move
+    bounded: NDArray  # (P,) 0 where it moves without bounds, 1 within a ball, 2 within a box
+    time_of: NDArray  # (M,) which variable each segment's time is
+    point_of: NDArray  # (M+1,) which point of the lap each point is
+    moving: NDArray  # (Q,) the points of a lap that may move
+
+    @property
+    def first(self) -> NDArray:
+        """Return the variables of the start."""
+        count = int(self.time_of.max()) + 1
+        logs = np.log(self.start.times[:count])
+        return np.concatenate([(logs - logs.mean()) / TIME_UNIT, np.zeros(3 * len(self.moving))])
+
+    def knots(self, x: NDArray) -> Knots:
+        """Return the times, which last as long as the start's together, and points of variables."""
+        offsets, _ = self._offsets(x)
+        points = self.start.points + offsets[self.point_of]
+        return self.start._replace(times=self._times(x), points=points)
+
+    def gradient(self, x: NDArray, by_times: NDArray, by_points: NDArray) -> NDArray:
+        """Return the gradient by the variables of what changes so with times, (M,), and points, (M+1, 3)."""
+        times = self._times(x)
+        by_logs = times * (by_times - by_times @ times / times.sum()) * TIME_UNIT
+        of_lap = np.zeros((len(self.axes), 3))
+        np.add.at(of_lap, self.point_of, by_points)
+        _, slopes = self._offsets(x)
+        by_moves = np.einsum("pc,pqc->pq", of_lap[self.moving], slopes)
+        return np.concatenate([np.bincount(self.time_of, by_logs), by_moves.ravel()])
+
+    def _times(self, x: NDArray) -> NDArray:
+        logs = TIME_UNIT * x[self.time_of]
+        times = np.exp(logs - logs.max())
+        return np.asarray(times * (self.start.times.sum() / times.sum()))
+
+    def _offsets(self, x: NDArray) -> tuple[NDArray, NDArray]:
+        """Return how far the points of a lap moved, (P, 3) m, and how that changes with their variables, (Q, 3, 3)."""
+        q = x[int(self.time_of.max()) + 1 :].reshape(-1, 3)
+        axes, bounded = self.axes[self.moving], self.bounded[self.moving, None]
+        squares = np.where(bounded == 1, (q**2).sum(axis=1, keepdims=True), q**2) * (bounded > 0)
+        root = np.sqrt(1.0 + squares)
+        offsets = np.zeros((len(self.axes), 3))
+        offsets[self.moving] = np.einsum("pq,pqc->pc", q / root, axes)
+        slopes = np.eye(3) / root[:, None]
+        slopes -= np.where(bounded == 1, 1.0, 0.0)[..., None] * q[:, :, None] * q[:, None] / root[..., None] ** 3
+        slopes -= np.where(bounded == 2, 1.0, 0.0)[..., None] * np.eye(3) * (q**2 / root**3)[:, None]
+        return offsets, np.einsum("pqr,prc->pqc", slopes, axes)
+
+
+def variables_of(knots: Knots, regions: tuple[Region, ...], laps: int, margin: float) -> ChoiceVariables:
+    """Return the variables of a start: of its times, of points between waypoints, and of waypoints with regions.
+
+    `regions` has one for each waypoint; `margin`, m, is kept from the sides of gates.
+    """
+    count, of_lap = len(knots.points), len(knots.times) // laps
+    point_of = np.arange(count) if laps == 1 else np.arange(count) % of_lap
+    points = knots.points[: point_of.max() + 1]
+    steps = np.linalg.norm(np.diff(knots.points, axis=0), axis=1)
+    near = np.minimum(np.append(steps, steps[-1]), np.append(steps[0], steps))[: len(points)]
+    units = np.minimum(POINT_UNIT * near, LARGEST_POINT_UNIT)
+    axes = units[:, None, None] * np.eye(3)
+    bounded = np.zeros(len(points), dtype=int)
+    moves = np.ones(len(points), dtype=bool)
+    for point, region in zip(knots.waypoint, regions, strict=True):
+        if point >= len(points):
+            continue  # of a later lap
+        match region:
+            case Within(radius):
+                axes[point], bounded[point] = radius * np.eye(3), 1
+            case Gate():
+                axes[point], bounded[point] = np.vstack([region.half_axes(margin), np.zeros(3)]), 2
+            case None:
+                moves[point] = False
+    return ChoiceVariables(knots, axes, bounded, np.arange(len(knots.times)) % of_lap, point_of, np.flatnonzero(moves))
+
+
+def with_points_between(waypoints: NDArray, times: NDArray) -> Knots:
+    """Return waypoints, (K, 3) m, with a point between each two, where the path of least snap is half-way in time."""
+    path = least_snap(waypoints, times)
+    breaks = np.concatenate([[0.0], np.cumsum(times)])
+    points = np.empty((2 * len(waypoints) - 1, 3))
+    points[::2], points[1::2] = waypoints, path((breaks[:-1] + breaks[1:]) / 2)
+    return Knots(np.repeat(times / 2, 2), points, np.arange(0, len(points), 2))
