@@ -46,8 +46,7 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
             at = int(np.argmax(np.where(np.isnan(moments.beyond), np.inf, moments.beyond)))
             beyond = float(moments.beyond[at])
             if not beyond <= farthest:
-                side = "inside" if inside(beyond) else "beyond"
-                farthest, worst = beyond, f"{what} ends {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
+                farthest, worst = beyond, f"{what} ends {limits.space.describe(beyond, int(moments.face[at]))}"
             if not inside(beyond) and not limits.link_loss.only_warn:
                 raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
         (results.append if inside(farthest) else results.warn)(f"link loss {worst}, at worst")

@@ -27,7 +27,7 @@ from cfplan.safety.limits import (
     within_reserve,
 )
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.safety.space import WALLS, Box, Cylinder, Space, inside
+from cfplan.safety.space import SIDES, Box, Cylinder, Space, inside
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
@@ -438,11 +438,11 @@ def _check_obstacles(limits: Limits, places: Places) -> None:
     if not space.obstacles:
         return
     middle, half = np.add(space.low, space.high) / 2, np.subtract(space.high, space.low) / 2
-    reach = space.beyond(middle, half)[WALLS:] - space.margin  # the room is a box: positive where it meets an obstacle
+    reach = space.beyond(middle, half)[SIDES:] - space.margin  # the room is a box: positive where it meets an obstacle
     if not (reach > 0.0).all():
         number = int(np.argmin(reach))
         raise InputError(
-            f"{space.faces[WALLS + number]} is not in the room",
+            f"{space.faces[SIDES + number]} is not in the room",
             where=places.where("space", "obstacles", number),
             hint="give its place in metres, in the frame of motion capture; leave it out where it is in another room",
         )

@@ -3,7 +3,7 @@
 A face is a wall, the floor, the ceiling, or the surface of an obstacle; plans keep the same margin from each.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,11 +17,12 @@ from cfplan.numbers import coordinates, shown
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
 FLOOR = 2  # its number among the faces
-WALLS = 6  # faces that are no obstacles, with floor and ceiling
+SIDES = 6  # faces of the room itself, with floor and ceiling; obstacles come behind
 TOLERANCE = 1e-6
 """m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
 packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
+_TOGETHER = 256  # positions, for which obstacles far from all of them are left out
 _PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
 _WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
 
@@ -95,6 +96,49 @@ class Space:
             [*walls, self.margin - _distances(_prisms(self.obstacles), points[..., None, :], around)], axis=-1
         )
 
+    def nearest(self, positions: ArrayLike, half: ArrayLike = 0.0, *, floor: bool = True) -> tuple[NDArray, NDArray]:
+        """Return, (N,) each, how far positions, (N, 3) m, are beyond the face where that is most, m, and its number.
+
+        As the largest of beyond(), in less time and memory where there are many obstacles. The floor may be left out.
+        """
+        points = np.asarray(positions, dtype=float)
+        sizes = np.broadcast_to(np.asarray(half, dtype=float), points.shape)
+        room = replace(self, obstacles=()).beyond(points, sizes)
+        if not floor:
+            room[:, FLOOR] = -np.inf
+        most, face = room.max(axis=1), room.argmax(axis=1)
+        if not self.obstacles:
+            return most, face
+        prisms = _prisms(self.obstacles)
+        for begin in range(0, len(points), _TOGETHER):
+            some = slice(begin, begin + _TOGETHER)
+            near = _near(prisms, points[some], sizes[some])
+            away = _distances(prisms.only(near), points[some, None], sizes[some, None])
+            which = away.argmin(axis=1)
+            beyond = self.margin - away[np.arange(len(away)), which]
+            closer = ~(beyond <= most[some])  # NaN is the worst
+            most[some] = np.where(closer, beyond, most[some])
+            face[some] = np.where(closer, SIDES + near[which], face[some])
+        return most, face
+
+    def swept(self, boxes: NDArray) -> tuple[NDArray, NDArray]:
+        """Return, (N,) each, how far vehicles come beyond a face, m, without its margin, and which is the worst.
+
+        `boxes`, (N, S, 2, 3) m, are what each sweeps on its way to the floor, which therefore does not count, in S
+        parts.
+        """
+        low, high = boxes[:, :, 0].reshape(-1, 3), boxes[:, :, 1].reshape(-1, 3)
+        beyond, face = (
+            each.reshape(boxes.shape[:2]) for each in self.nearest((low + high) / 2, (high - low) / 2, floor=False)
+        )
+        number, worst = np.arange(len(boxes)), beyond.argmax(axis=1)
+        return beyond[number, worst] - self.margin, face[number, worst]
+
+    def describe(self, beyond: float, face: int) -> str:
+        """Return where a place is that is so far, m, beyond a face: "0.12 m beyond the wall x = 2 m"."""
+        clear, past = ("from", "into") if face >= SIDES else ("inside", "beyond")
+        return f"{abs(beyond):.2f} m {clear if inside(beyond) else past} {self.faces[face]}"
+
     def holds(self, positions: ArrayLike, rounding: float = 0.0) -> bool:
         """Return whether all positions, (..., 3) m, keep the margin from all faces; see inside()."""
         return bool(np.all(inside(self.beyond(positions), rounding)))
@@ -123,8 +167,12 @@ class _Prisms(NamedTuple):
     cos: NDArray  # (K,) of the yaw
     sin: NDArray  # (K,)
 
-    def some(self, numbers: NDArray) -> "_Prisms":
-        """Return those with these numbers, (P, 1) of them for (P, N) points."""
+    def only(self, numbers: NDArray) -> "_Prisms":
+        """Return those with these numbers."""
+        return _Prisms(*(values[numbers] for values in self))
+
+    def of_rows(self, numbers: NDArray) -> "_Prisms":
+        """Return one for each of P rows of points, (P, N, 3)."""
         return _Prisms(*(values[numbers][:, None] for values in self))
 
 
@@ -158,6 +206,14 @@ def _distances(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> NDArr
     """
     _, over = _offsets(prisms, points, half)
     return _joined(_joined(over[..., 0], over[..., 1]) - prisms.radius, over[..., 2])
+
+
+def _near(prisms: _Prisms, points: NDArray, half: NDArray) -> NDArray:
+    """Return the numbers of the prisms among which the nearest of each point, (N, 3), is."""
+    low, high = (points - half).min(axis=0), (points + half).max(axis=0)
+    reach = float(np.linalg.norm(high - low)) / 2
+    away = _distances(prisms, (low + high) / 2)
+    return np.flatnonzero(~(away > away.min() + 2.0 * reach))
 
 
 def _distances_with_slopes(prisms: _Prisms, points: NDArray) -> tuple[NDArray, NDArray]:
@@ -209,15 +265,15 @@ def distances_beyond(path: Path, space: Space) -> tuple[NDArray, NDArray]:
     The distance is that of the worst face less its margin, negative inside. It holds between the samples too, where a
     coordinate exceeds both by at most step² / 8 of its second derivative; s is where about it is the worst.
     """
-    s = path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
+    s = _samples(path)
     places, bend = path(s), np.abs(path(s, 2)).max(axis=1)
     step = np.diff(path.breaks) / (_SAMPLES - 1)
     between = (step[:, None] ** 2 / 8 * bend)[:, None]
-    walls = Space(space.low, space.high, space.margin)
-    beyond = (walls.beyond(places) + np.concatenate([between, between], axis=-1)).max(axis=-1)
+    room = replace(space, obstacles=())
+    beyond = (room.beyond(places) + np.concatenate([between, between], axis=-1)).max(axis=-1)
     if not space.obstacles:
         return s, beyond
-    at, near = _beyond_obstacles(path, space, s, places, np.linalg.norm(bend, axis=1))
+    at, near = beyond_obstacles(path, space)
     return np.where(near > beyond, at, s), np.maximum(near, beyond)
 
 
@@ -237,13 +293,21 @@ class _Stretches(NamedTuple):
         return _Stretches(*(values[which] for values in self))
 
 
-def _beyond_obstacles(path: Path, space: Space, s: NDArray, places: NDArray, bend: NDArray) -> tuple[NDArray, NDArray]:
-    """Return s, (M, N), and at most how far the path is beyond any obstacle less its margin between there and the next.
+def _samples(path: Path) -> NDArray:
+    """Return (M, N) s, of each piece."""
+    return np.asarray(path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES))
 
-    `bend`, (M,), is the largest second derivative of each piece. Along a chord of the path a distance is convex, so it
-    is nowhere below the tangents at both ends, and the path is no farther from the chord than step² / 8 of `bend`.
-    Where that does not decide, a stretch is cut into shorter ones.
+
+@lru_cache(maxsize=16)
+def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
+    """Return s, (M, N), and at most how far the path is beyond an obstacle less its margin around there, (M, N) m.
+
+    As distances_beyond(), of a space that has obstacles. Along a chord of the path a distance is convex, so it is
+    nowhere below its tangents at both ends, and the path is no farther from the chord than step² / 8 of its second
+    derivative. Where that does not decide, a stretch is cut into shorter ones.
     """
+    s = _samples(path)
+    places, bend = path(s), np.linalg.norm(path(s, 2), axis=-1).max(axis=1)
     prisms, count = _prisms(space.obstacles), s.shape[1]
     middle = places[:, count // 2]
     around = np.linalg.norm(places - middle[:, None], axis=-1).max(axis=1)
@@ -269,6 +333,8 @@ def _beyond_obstacles(path: Path, space: Space, s: NDArray, places: NDArray, ben
         cell = np.repeat(coarse.cell[:, None], _PARTS, axis=1)
         stretches = _cut(path, space, prisms, bend, cell, coarse.piece, coarse.obstacle, nodes)
     at[:, -1], beyond[:, -1] = at[:, -2], beyond[:, -2]
+    for each in (at, beyond):
+        each.setflags(write=False)
     return at, beyond
 
 
@@ -284,7 +350,7 @@ def _cut(
 ) -> _Stretches:
     """Return the stretches between nodes, (P, n) s, for `cell`, (P, n - 1), beside the obstacle of each row."""
     places = path(nodes)
-    distance, slope = _distances_with_slopes(prisms.some(obstacle), places)
+    distance, slope = _distances_with_slopes(prisms.of_rows(obstacle), places)
     way = np.diff(places, axis=1)
     begin, end = distance[:, :-1], distance[:, 1:]
     falls, rises = (slope[:, :-1] * way).sum(axis=-1), (slope[:, 1:] * way).sum(axis=-1)
@@ -317,7 +383,7 @@ def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
     beyond = space.beyond(point)
     face = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
     outside = beyond[face] - space.margin
-    obstacle = face >= WALLS
+    obstacle = face >= SIDES
     past, too = ("inside", "near") if obstacle else ("beyond", "far")
     far = f"{outside:.3f} m {past}" if outside > 0 else f"{abs(outside):.3f} m from"
     hint = "move or place the path, or correct `space` in safety.yaml if the room is larger"

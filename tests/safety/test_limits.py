@@ -12,7 +12,7 @@ from cfplan.errors import InputError
 from cfplan.flight.firmware import NEWEST_KNOWN
 from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import DEFAULTS, load_limits
-from cfplan.safety.space import WALLS, Box, Cylinder
+from cfplan.safety.space import SIDES, Box, Cylinder
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
@@ -221,7 +221,7 @@ def test_obstacles_are_boxes_that_may_be_turned_and_cylinders_on_the_floor(tmp_p
     table, pole = space.obstacles
     assert table == Box((0.5, 1.0, 0.0), (1.5, 2.0, 0.8), math.radians(30), "table")
     assert pole == Cylinder(-1.0, 2.0, 0.1, -0.1, 1.4)
-    assert space.faces[WALLS:] == ("the obstacle 'table'", "obstacle 2")
+    assert space.faces[SIDES:] == ("the obstacle 'table'", "obstacle 2")
     assert load_limits(SAFETY).space.obstacles == ()
 
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.safety.space import TOLERANCE, WALLS, Box, Cylinder, Space, check_space, distances_beyond, inside
+from cfplan.safety.space import SIDES, TOLERANCE, Box, Cylinder, Space, check_space, distances_beyond, inside
 
 SPACE = Space(low=(-2.0, -3.0, 0.0), high=(2.0, 3.0, 2.0), margin=0.2)
 coordinate = st.floats(-2.2, 2.2)
@@ -107,8 +107,8 @@ AROUND = directions(6000)
 def test_the_distance_from_an_obstacle_is_that_of_the_nearest_place_on_the_other_side_of_its_surface(obstacle, point):
     space = Space((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0), 0.25, (obstacle,))
     beyond = space.beyond(point)
-    assert beyond.shape == (WALLS + 1,)
-    distance, here = 0.25 - beyond[WALLS], within(obstacle, np.array([point]))[0]
+    assert beyond.shape == (SIDES + 1,)
+    distance, here = 0.25 - beyond[SIDES], within(obstacle, np.array([point]))[0]
     assert (distance < 0.0) == here or abs(distance) < 1e-9
     size = abs(distance)
     # Nothing nearer than that is on the other side; a little farther something is, seen from some direction.
@@ -123,11 +123,11 @@ def test_the_distance_from_an_obstacle_is_that_of_the_nearest_place_on_the_other
 def test_a_box_about_a_place_is_at_most_as_far_from_an_obstacle_as_its_nearest_point(obstacle, point, half):
     space = Space((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0), 0.25, (obstacle,))
     grid = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 3), axis=-1).reshape(-1, 3)
-    nearest = space.beyond(np.array(point) + grid * half)[:, WALLS].max()
-    assert space.beyond(point, half)[WALLS] >= nearest - 1e-9
+    nearest = space.beyond(np.array(point) + grid * half)[:, SIDES].max()
+    assert space.beyond(point, half)[SIDES] >= nearest - 1e-9
     if isinstance(obstacle, Cylinder) or obstacle.yaw == 0.0:
         reach = np.linalg.norm(half) / 8
-        assert nearest > 0.25 or space.beyond(point, half)[WALLS] <= nearest + reach
+        assert nearest > 0.25 or space.beyond(point, half)[SIDES] <= nearest + reach
 
 
 @settings(max_examples=60, deadline=None)

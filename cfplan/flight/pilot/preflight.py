@@ -332,11 +332,10 @@ def check_fall(snapshot: PreflightSnapshot) -> Check:
     ways.append(_hover_to_hover((x, y, height), mission.on_board.begin[:3], limits.ground.go_to_speed))
     falls = falls_from(np.concatenate(ways), limits, mission.on_board.deviation)
     beyond = float(falls.beyond[falls.worst])
-    where = falls.name_of_wall(falls.worst, limits)
-    side = "from" if inside(beyond) else "beyond"
-    found = f"trajectory {mission.on_board.falls}; before it {abs(beyond):.2f} m {side} "
+    where = limits.space.describe(beyond, int(falls.face[falls.worst]))
+    found = f"trajectory {mission.on_board.falls}; before it {where}"
     return Check(
-        "fall after link loss", found + where, "inside the walls", bool(inside(beyond)) or limits.link_loss.only_warn,
+        "fall after link loss", found, "inside the walls", bool(inside(beyond)) or limits.link_loss.only_warn,
         "move the vehicle towards the middle of the room, or lower `ground.go_to_speed`",
     )  # fmt: skip
 
