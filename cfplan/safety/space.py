@@ -22,6 +22,7 @@ TOLERANCE = 1e-6
 """m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
 packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
+_BLOCK = 16  # positions that follow one another, about which a box may tell enough
 _TOGETHER = 256  # positions, for which obstacles far from all of them are left out
 _PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
 _WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
@@ -121,6 +122,28 @@ class Space:
             face[some] = np.where(closer, SIDES + near[which], face[some])
         return most, face
 
+    def farthest(self, positions: NDArray) -> float:
+        """Return how far the worst of positions, (N, 3) m, is beyond a face less its margin, m.
+
+        Made for many that follow a way. Where all are clear, obstacles may be farther off than it says.
+        """
+        if not self.obstacles:
+            return float(self.beyond([positions.min(axis=0), positions.max(axis=0)]).max())
+        begins = np.arange(0, len(positions), _BLOCK)
+        low, high = np.minimum.reduceat(positions, begins), np.maximum.reduceat(positions, begins)
+        bound, _ = self.nearest((low + high) / 2, (high - low) / 2)
+        near = ~(bound <= 0.0)
+        if not near.any():
+            return float(bound.max())
+        exact, _ = self.nearest(positions[np.repeat(near, np.diff(begins, append=len(positions)))])
+        return float(max(exact.max(), bound[~near].max(initial=-np.inf)))
+
+    def above_floor(self, positions: NDArray) -> tuple[NDArray, NDArray]:
+        """Return, as nearest(), how far the columns between the floor and positions, (N, 3) m, are beyond a face."""
+        half = 0.5 * (positions[:, 2] - self.low[2])
+        columns = np.stack([positions[:, 0], positions[:, 1], positions[:, 2] - half], axis=1)
+        return self.nearest(columns, np.stack([0.0 * half, 0.0 * half, half], axis=1), floor=False)
+
     def swept(self, boxes: NDArray) -> tuple[NDArray, NDArray]:
         """Return, (N,) each, how far vehicles come beyond a face, m, without its margin, and which is the worst.
 
@@ -138,6 +161,10 @@ class Space:
         """Return where a place is that is so far, m, beyond a face: "0.12 m beyond the wall x = 2 m"."""
         clear, past = ("from", "into") if face >= SIDES else ("inside", "beyond")
         return f"{abs(beyond):.2f} m {clear if inside(beyond) else past} {self.faces[face]}"
+
+    def too(self, face: int) -> str:
+        """Return what a place is that is beyond a face less its margin: "far out", "near the obstacle 'table'"."""
+        return f"near {self.faces[face]}" if face >= SIDES else "far out"
 
     def holds(self, positions: ArrayLike, rounding: float = 0.0) -> bool:
         """Return whether all positions, (..., 3) m, keep the margin from all faces; see inside()."""

@@ -32,7 +32,7 @@ from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import SIDES, inside
 from cfplan.simulation.dynamics.body import pack_body
 from cfplan.simulation.dynamics.branching import SNAPSHOT_SIZE, arrival_steps, hovering_snapshot, setpoint_rows
 from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
@@ -64,9 +64,14 @@ class LinkLoss:
     moment: float  # s from the first setpoint
     distance: float  # m, horizontally from the last setpoint to the far corner of the box that the vehicle sweeps
     beyond: float  # m beyond a wall or the ceiling, or into an obstacle; negative inside
+    at_obstacle: bool = False  # whether that is an obstacle
 
     def __str__(self) -> str:
-        walls = "inside the walls" if inside(self.beyond) else f"{self.beyond:.1f} m beyond the walls"
+        walls = (
+            "inside the walls"
+            if inside(self.beyond)
+            else f"{self.beyond:.1f} m {'into an obstacle' if self.at_obstacle else 'beyond the walls'}"
+        )
         comes_down = f"the vehicle comes down {self.distance:.1f} m farther on, {walls}"
         return f"lost at the worst moment, {self.moment:.1f} s, {comes_down}"
 
@@ -89,7 +94,8 @@ class LinkLossMoments:
     def worst(self) -> LinkLoss:
         """Return the setpoint after which the vehicle ends farthest out; what is not a number is farthest."""
         at = int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
-        return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]))
+        at_obstacle = bool(self.face[at] >= SIDES)
+        return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]), at_obstacle)
 
     @property
     def low(self) -> NDArray:
