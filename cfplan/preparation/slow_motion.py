@@ -4,11 +4,12 @@ must come down inside the walls.
 Where it will stand before take-off is not known yet. The worst is a way straight towards a wall or away from one that
 is just so long that it takes the least time, as nothing else accelerates as much, and take-off beside two walls. So
 these are looked at: to the start from all sides so far away, from each wall and from each corner, and take-off there.
-Of these, what an obstacle stands in or beneath is left out: preflight allows no such way. Beside an obstacle, at the
-margin, a vehicle drifts no farther than beside a wall.
+Of these, ways that an obstacle stands in or beneath are left out, as preflight allows none, and those that begin close
+beside one: where a vehicle stands between a wall and an obstacle, each keeps it from the other.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -29,6 +30,7 @@ from cfplan.simulation.link_loss import link_loss_of_slow_motion
 
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
 _PLACES = 200  # on the way to the start, that are looked at for obstacles
+_BESIDE = 0.3  # m more than the margin from obstacles, where a take-off tells about walls
 _BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
 _NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 _TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
@@ -61,11 +63,12 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
 def _motions(mission: Mission) -> Iterator[_Motion]:
     space, ground, height = mission.limits.space, mission.limits.ground, mission.take_off_height
     (x, y, z), yaw = mission.start
+    beside = replace(space, low=(-np.inf, -np.inf, space.low[2]), high=(np.inf,) * 3, margin=space.margin + _BESIDE)
     low, high = np.add(space.low, space.margin), np.subtract(space.high, space.margin)
     sides = [(low[0], y), (high[0], y), (x, low[1]), (x, high[1])]
     corners = list(product((low[0], high[0]), (low[1], high[1])))
     for side, other in corners[::3]:  # two, which face all walls
-        if not _clear((side, other, height), (side, other, height), space):
+        if not _clear((side, other, height), (side, other, height), beside):
             continue
         begin, above = (float(side), float(other), space.low[2]), (float(side), float(other), height)
         climb = manoeuvre_time(height - space.low[2], ground.take_off_speed)
@@ -74,7 +77,7 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
     near = [np.clip((x + a * reach, y + b * reach), low[:2], high[:2]) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
     for place in [*near, *sides, *corners]:
         begin = (float(place[0]), float(place[1]), height)
-        if not _clear(begin, (x, y, z), space):
+        if not (_clear(begin, begin, beside) and _clear(begin, (x, y, z), space)):
             continue
         duration = manoeuvre_time(float(np.linalg.norm(np.subtract((x, y, z), begin))), ground.go_to_speed)
         way = _way(begin, (x, y, z), yaw + _TURN, yaw, duration, mission)
