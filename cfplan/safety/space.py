@@ -23,6 +23,7 @@ TOLERANCE = 1e-6
 packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
 _BLOCK = 16  # positions that follow one another, about which a box may tell enough
+_ROUND = 33  # points around a cylinder that is drawn
 _TOGETHER = 256  # positions, for which obstacles far from all of them are left out
 _PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
 _WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
@@ -70,6 +71,18 @@ class Cylinder:
         return (self.x, self.y, (self.low + self.high) / 2, 0.0, 0.0, (self.high - self.low) / 2, self.radius, 0.0)
 
 
+Obstacle = Box | Cylinder
+
+
+def outline(obstacle: Obstacle) -> NDArray:
+    """Return an obstacle as it is seen from above, (N, 2) m, as a closed polygon."""
+    x, y, _, a, b, _, radius, yaw = obstacle.prism
+    turn = np.linspace(0.0, 2.0 * np.pi, _ROUND) if radius else np.pi * (np.arange(5) / 2 + 0.25)
+    flat = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    own = radius * flat if radius else np.sign(flat) * (a, b)
+    return np.array([x, y]) + own @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
 @dataclass(frozen=True, slots=True)
 class Space:
     """A box, the obstacles in it, and the distance that plans keep from its walls and from these."""
@@ -77,7 +90,7 @@ class Space:
     low: tuple[float, float, float]  # m
     high: tuple[float, float, float]  # m
     margin: float  # m, positive
-    obstacles: tuple[Box | Cylinder, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
     def beyond(self, positions: ArrayLike, half: ArrayLike = 0.0) -> NDArray:
         """Return (..., 6 + K) m: how far positions, (..., 3) m, are beyond each face less its margin; negative: clear.
@@ -204,7 +217,7 @@ class _Prisms(NamedTuple):
 
 
 @lru_cache(maxsize=8)
-def _prisms(obstacles: tuple[Box | Cylinder, ...]) -> _Prisms:
+def _prisms(obstacles: tuple[Obstacle, ...]) -> _Prisms:
     """Return obstacles in one form, of which a box has no radius, and of a cylinder the rectangle is a point."""
     table = np.array([each.prism for each in obstacles])
     return _Prisms(table[:, :3], table[:, 3:6], table[:, 6], np.cos(table[:, 7]), np.sin(table[:, 7]))
