@@ -55,7 +55,7 @@ def _without_walls(source: Path, limits: "Limits", steps: "Steps") -> "Plan":
     from cfplan.planning.path.choice import chosen_path
     from cfplan.planning.plan import plan
 
-    everywhere = replace(limits.space, low=(-FAR, -FAR, -FAR), high=(FAR, FAR, FAR))
+    everywhere = replace(limits.space, low=(-FAR, -FAR, -FAR), high=(FAR, FAR, FAR), obstacles=())
     for_ever = replace(limits.battery, endurance=math.inf)
     limits = replace(limits, space=everywhere, battery=for_ever)
     with steps.step("plan") as results:

@@ -201,11 +201,11 @@ def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float
 
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
-    beyond = limits.space.beyond(points).max(axis=1)
+    beyond, face = limits.space.nearest(points)
     if not (good := inside(beyond) | np.isnan(beyond)).all():  # NaN is refused where the path is made
         at = int(np.argmin(good))
         raise InfeasibleError(
-            f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too far out",
+            f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too {limits.space.too(face[at])}",
             where=f"waypoint {at + 1}",
             hint="keep waypoints inside the space less its margin",
         )

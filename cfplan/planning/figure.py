@@ -17,6 +17,7 @@ from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.waypoints import Gate, Within
 from cfplan.planning.active_limits import FREE, FREE_COLOUR, LIMIT_COLOURS, ActiveLimits, active_limits, on_white
 from cfplan.planning.plan_result import Plan
+from cfplan.safety.space import Space, outline
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +27,7 @@ SUFFIXES = (".png", ".pdf", ".svg")
 SHOWN = 0.5  # share that a limit comes to somewhere, from which on it gets a curve
 INSET = 0.06  # m at least, half of the side of what is magnified
 FLOWN = "#141414"  # what was flown
+OBSTACLE = "#c9bfae"
 AXES = ("x", "y", "z")
 
 
@@ -112,6 +114,7 @@ def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | No
     for inset, style in ((0.0, {"lw": 1.4}), (space.margin, {"lw": 0.8, "ls": "--"})):
         corner, size = low + inset, high - low - 2 * inset
         axes.add_patch(Rectangle((corner[0], corner[1]), size[0], size[1], fill=False, ec="0.35", **style))
+    _draw_obstacles(axes, space, across, up)
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")
     if across == 1:  # with x up the page, y grows to the left
         axes.invert_xaxis()
@@ -139,6 +142,20 @@ def _draw_waypoints(axes: "Axes", path_file: PathFile, across: int, up: int) -> 
             sides, top = region.half_axes(0.0)
             corners = point + np.array([sides + top, sides - top, -sides - top, top - sides, sides + top])
             axes.plot(*corners[:, (across, up)].T, color="0.2", lw=1.4)
+
+
+def _draw_obstacles(axes: "Axes", space: Space, across: int, up: int) -> None:
+    """Draw the obstacles along two of the room's axes, with their names."""
+    for obstacle in space.obstacles:
+        _, _, z, _, _, tall, _, _ = obstacle.prism
+        around = outline(obstacle)
+        corners = np.column_stack([np.repeat(around, 2, axis=0), np.tile([z - tall, z + tall], len(around))])
+        low, high = corners.min(axis=0)[[across, up]], corners.max(axis=0)[[across, up]]
+        shape = around[:, [across, up]] if up != 2 else [low, (high[0], low[1]), high, (low[0], high[1])]
+        axes.fill(*np.transpose(shape), color=OBSTACLE, lw=0.0)
+        if obstacle.name and up != 2:
+            x, y = ((low + high) / 2).tolist()
+            axes.text(x, y, obstacle.name, ha="center", va="center", fontsize=7, parse_math=False, clip_on=True)
 
 
 def draw_path(axes: "Axes", active: ActiveLimits, *along: int) -> None:

@@ -9,7 +9,7 @@ every motor lag.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.setpoints.stops import DURATION, encode_stops
-from cfplan.numbers import shown
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import SIDES
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
-    WALLS,
     LinkLossMoments,
     link_loss_near_walls,
     link_loss_within_stops,
@@ -41,10 +39,10 @@ GRIDS = ((STOPS_EVERY, STOPS_EACH, 0.18), (3, 4, 0.1), (1, 2, 0.0))
 
 def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MARGIN) -> Assessment:
     """Simulate that each setpoint is the last one; what comes down within `margin`, m, of a wall is at fault."""
-    moments = link_loss_near_walls(encoded.payloads, limits, margin)
+    moments, faces = link_loss_near_walls(encoded.payloads, limits, margin), limits.space.faces
 
     def describe(at: int) -> str:
-        return f"takes the vehicle {_how_far(moments.beyond[at])} {moments.name_of_wall(at, limits)}"
+        return f"takes the vehicle to {limits.space.describe(moments.beyond[at], moments.face[at])}"
 
     return Assessment(
         what="link loss",
@@ -52,7 +50,7 @@ def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MAR
         excess=moments.beyond + margin,
         reach=_reach(moments),
         describe=describe,
-        near=lambda at: moments.name_of_wall(at, limits),
+        near=lambda at: faces[moments.face[at]],
         hint=OUTSIDE_HINT,
         simulated=SimulatedLinkLoss(encoded.payloads, moments),
     )
@@ -88,10 +86,10 @@ def assess_link_loss_of_stops(
             _about(_sample(sampled, asked, encoded, limits, plan, margin, made) > -near, every, each),
             done | asked,
         )
-    moments = replace(plan, wall=sampled.wall)
+    faces = limits.space.faces
 
     def describe(at: int) -> str:
-        return f"takes the vehicle {_how_far(sampled.beyond[at])} {moments.name_of_wall(at, limits)}"
+        return f"takes the vehicle to {limits.space.describe(sampled.beyond[at], sampled.face[at])}"
 
     return Assessment(
         what="link loss within a stop",
@@ -99,7 +97,7 @@ def assess_link_loss_of_stops(
         excess=sampled.beyond + margin,
         reach=sampled.reach,
         describe=describe,
-        near=lambda at: moments.name_of_wall(at, limits),
+        near=lambda at: faces[sampled.face[at]],
         hint=OUTSIDE_HINT,
     )
 
@@ -108,9 +106,9 @@ def assess_link_loss_of_stops(
 class _Sampled:
     """The worst that was sampled of the stops from each setpoint; written as samples come."""
 
-    beyond: NDArray  # (N,) m beyond a wall; -inf where no stop was sampled
+    beyond: NDArray  # (N,) m beyond a face of the space; -inf where no stop was sampled
     reach: NDArray  # (N,) m
-    wall: NDArray  # (N,) int, as in WALLS
+    face: NDArray  # (N,) int, of the space
 
 
 def _sample(
@@ -131,14 +129,14 @@ def _sample(
     forks, starts = asked[begin], plan.snapshots[:, begin]
     stops = made(begin)
     seen = link_loss_within_stops(stops, starts, limits, forks, coarsely=True)
-    beyond, reach, wall = seen.beyond + ALLOWANCE, _reach(seen), seen.wall
+    beyond, reach, face = seen.beyond + ALLOWANCE, _reach(seen), seen.face
     in_doubt = ~(beyond < -margin)
     if in_doubt.any():
         exactly = forks.copy()
         exactly[forks] = in_doubt
         some = exactly.any(axis=1)
         found = link_loss_within_stops(stops[some], starts[:, some], limits, exactly[some])
-        beyond[in_doubt], reach[in_doubt], wall[in_doubt] = found.beyond, _reach(found), found.wall
+        beyond[in_doubt], reach[in_doubt], face[in_doubt] = found.beyond, _reach(found), found.face
     beyond = np.where(np.isnan(beyond), np.inf, beyond)
 
     rates = decode(stops.reshape(-1, PAYLOAD_SIZE)).body_rate[:, :2]
@@ -153,7 +151,7 @@ def _sample(
     numbers[forks] = np.arange(len(beyond))
     at = numbers[np.arange(len(begin)), of_all.argmax(axis=1)]
     worse = beyond[at] > sampled.beyond[begin]
-    for values, new in ((sampled.beyond, beyond), (sampled.reach, reach), (sampled.wall, wall)):
+    for values, new in ((sampled.beyond, beyond), (sampled.reach, reach), (sampled.face, face)):
         values[begin[worse]] = new[at[worse]]
     return near
 
@@ -177,11 +175,8 @@ def _every(count: int, step: int) -> NDArray:
 
 
 def _reach(moments: LinkLossMoments) -> NDArray:
-    """Return how far each goes towards the wall that it comes nearest to, m, positive."""
-    number, (axis, side) = np.arange(len(moments.wall)), np.array(WALLS)[moments.wall].T
-    reach = np.where(side[:, None], moments.high - moments.place, moments.place - moments.low)[number, axis]
+    """Return how far each goes towards the wall that it comes nearest to, m, positive; aside if that is an obstacle."""
+    to_walls = np.concatenate([moments.place - moments.low, moments.high - moments.place], axis=1)
+    wall = np.minimum(moments.face, SIDES - 1)
+    reach = np.where(moments.face < SIDES, to_walls[np.arange(len(wall)), wall], moments.distance)
     return np.maximum(reach, _LEAST_REACH)
-
-
-def _how_far(beyond: float) -> str:
-    return f"within {shown(-beyond, '.2f')} m of" if inside(beyond) else f"{beyond:.2f} m beyond"

@@ -26,7 +26,6 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.encoding import RATE, encode_motion, encode_trajectory
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.numbers import shown
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials
 from cfplan.preparation.local_slowing import Assessment, slow_locally
@@ -105,6 +104,8 @@ def prepare_on_board_flight(
 def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
     """Return the plan, slower where the vehicle would fall beyond the walls. Raises InfeasibleError where it must."""
 
+    space = planned.limits.space
+
     def assess(trajectory: Trajectory) -> list[Assessment]:
         time = np.arange(int(np.ceil(trajectory.duration * RATE)) + 1) / RATE
         state = trajectory.at(time)
@@ -117,8 +118,8 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
                 time=time,
                 excess=falls.beyond + _MARGIN,
                 reach=np.maximum(falls.reach, 1e-3),
-                describe=lambda at: f"ends {_beyond(falls.beyond[at])} {falls.name_of_wall(at, planned.limits)}",
-                near=lambda at: falls.name_of_wall(at, planned.limits),
+                describe=lambda at: f"ends {space.describe(falls.beyond[at], falls.face[at])}",
+                near=lambda at: space.faces[falls.face[at]],
                 hint=_FALL_HINT,
             )
         ]
@@ -127,10 +128,6 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
         slowed, _ = slow_locally(planned.plan, assess)
         results.append(slowed.describe_slowing() or "not needed")
     return replace(planned, plan=slowed)
-
-
-def _beyond(beyond: float) -> str:
-    return f"{shown(-beyond, '.2f')} m from" if inside(beyond) else f"{beyond:.2f} m beyond"
 
 
 def _require_harmless_fall(
@@ -146,7 +143,7 @@ def _require_harmless_fall(
         at = falls.worst
         beyond = float(falls.beyond[at])
         lost = LinkLoss(float(time[at]), float(falls.distance[at]), beyond)
-        where = f"{_beyond(beyond)} {falls.name_of_wall(at, limits)}"
+        where = limits.space.describe(beyond, int(falls.face[at]))
         (results.append if inside(beyond) else results.warn)(f"its watchdog stops the motors, it falls {where} at most")
         if not inside(beyond) and not limits.link_loss.only_warn:
             raise NotCertifiedError(
@@ -201,13 +198,13 @@ def check_stops(stops: NDArray, limits: Limits) -> None:
                 f"a stop reaches a {quantity.noun} of {value[at]:.3g} {quantity.unit}; it may be {limit:.3g}",
                 where=f"stop at {at // count / RATE:.2f} s", hint="plan with a lower speed or acceleration",
             )  # fmt: skip
-    beyond = limits.space.beyond(states[:, 0, :3]).max(axis=1)
+    beyond, face = limits.space.nearest(states[:, 0, :3])
     if not inside(beyond).all():
         at = int(np.argmax(beyond))
         raise NotCertifiedError(
-            f"a stop comes {beyond[at]:.2f} m nearer to the walls than the margin",
+            f"a stop comes {beyond[at]:.2f} m nearer to {limits.space.faces[face[at]]} than the margin",
             where=f"stop at {at // count / RATE:.2f} s",
-            hint="keep the path farther from the walls, or plan with a lower speed",
+            hint="keep the path farther from there, or plan with a lower speed",
         )
 
 

@@ -94,13 +94,14 @@ class PlannerWorker:
 
     @property
     def _middle(self) -> list[tuple[float, ...]]:
-        """Return two places in the middle of the space, m, apart."""
+        """Return two places in the middle of the space, m, apart; without those that obstacles take."""
         space = self._limits.space
         shares = (0.4, 0.6)
-        return [
+        places = [
             tuple(low + share * (high - low) for low, high in zip(space.low, space.high, strict=True))
             for share in shares
         ]
+        return [place for place in places if space.holds(place)]
 
     def warm_up(self) -> None:
         """Make two plans and stops for nobody: what a first call compiles or loads is there before the flight."""

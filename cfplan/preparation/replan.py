@@ -183,10 +183,10 @@ def hold_hover(position: Triple, yaw: float, limits: Limits) -> HeldFlight:
 
     Raises InfeasibleError where that lies outside the space, or link loss there would end outside the walls.
     """
-    beyond = float(limits.space.beyond(np.array([position])).max())
+    (beyond,), (face,) = limits.space.nearest(np.array([position]))
     if not inside(beyond):
         raise InfeasibleError(
-            f"the hover at {coordinates(position, '.2f')} m is {beyond:.2f} m too far out",
+            f"the hover at {coordinates(position, '.2f')} m is {beyond:.2f} m too {limits.space.too(face)}",
             where="take-off",
             hint="take off to a height inside the space less its margin, and nearer to the middle of the room",
         )

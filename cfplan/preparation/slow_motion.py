@@ -4,9 +4,12 @@ must come down inside the walls.
 Where it will stand before take-off is not known yet. The worst is a way straight towards a wall or away from one that
 is just so long that it takes the least time, as nothing else accelerates as much, and take-off beside two walls. So
 these are looked at: to the start from all sides so far away, from each wall and from each corner, and take-off there.
+Of these, ways that an obstacle stands in or beneath are left out, as preflight allows none, and those that begin close
+beside one: where a vehicle stands between a wall and an obstacle, each keeps it from the other.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -14,6 +17,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.pilot.mission import SHORTEST_MANOEUVRE, Mission, manoeuvre_time
+from cfplan.flight.setpoints.commitment import QUANTUM
 from cfplan.flight.setpoints.descent import descent, gentle
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
@@ -21,10 +25,12 @@ from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.numbers import coordinates
 from cfplan.preparation.steps import OnStep, ignore_steps, step
-from cfplan.safety.space import inside
+from cfplan.safety.space import Space, inside
 from cfplan.simulation.link_loss import link_loss_of_slow_motion
 
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
+_PLACES = 200  # on the way to the start, that are looked at for obstacles
+_BESIDE = 0.3  # m more than the margin from obstacles, where a take-off tells about walls
 _BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
 _NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 _TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
@@ -37,17 +43,18 @@ _Motion = tuple[str, str, NDArray]  # what it is and from where, a hint, its pay
 def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_steps) -> None:
     """Simulate link loss in take-off, on the way to the start, and in landing after the mission.
 
-    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
+    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn, and
+    where the landing ends on an obstacle.
     """
     limits, farthest, worst = mission.limits, -np.inf, ""
     with step(on_step, "slow phases") as results:
+        _require_clear_landing(mission)
         for what, hint, payloads in _motions(mission):
             moments = link_loss_of_slow_motion(payloads, limits, mission.rate)
             at = int(np.argmax(np.where(np.isnan(moments.beyond), np.inf, moments.beyond)))
             beyond = float(moments.beyond[at])
             if not beyond <= farthest:
-                side = "inside" if inside(beyond) else "beyond"
-                farthest, worst = beyond, f"{what} ends {abs(beyond):.2f} m {side} {moments.name_of_wall(at, limits)}"
+                farthest, worst = beyond, f"{what} ends {limits.space.describe(beyond, int(moments.face[at]))}"
             if not inside(beyond) and not limits.link_loss.only_warn:
                 raise NotCertifiedError(f"link loss {worst}", where="link loss", hint=hint)
         (results.append if inside(farthest) else results.warn)(f"link loss {worst}, at worst")
@@ -56,10 +63,13 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
 def _motions(mission: Mission) -> Iterator[_Motion]:
     space, ground, height = mission.limits.space, mission.limits.ground, mission.take_off_height
     (x, y, z), yaw = mission.start
+    beside = replace(space, low=(-np.inf, -np.inf, space.low[2]), high=(np.inf,) * 3, margin=space.margin + _BESIDE)
     low, high = np.add(space.low, space.margin), np.subtract(space.high, space.margin)
     sides = [(low[0], y), (high[0], y), (x, low[1]), (x, high[1])]
     corners = list(product((low[0], high[0]), (low[1], high[1])))
     for side, other in corners[::3]:  # two, which face all walls
+        if not _clear((side, other, height), (side, other, height), beside):
+            continue
         begin, above = (float(side), float(other), space.low[2]), (float(side), float(other), height)
         climb = manoeuvre_time(height - space.low[2], ground.take_off_speed)
         yield f"in take-off at {_text(begin)}", _TAKE_OFF_HINT, _way(begin, above, yaw, yaw, climb, mission)
@@ -67,6 +77,8 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
     near = [np.clip((x + a * reach, y + b * reach), low[:2], high[:2]) for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1))]
     for place in [*near, *sides, *corners]:
         begin = (float(place[0]), float(place[1]), height)
+        if not (_clear(begin, begin, beside) and _clear(begin, (x, y, z), space)):
+            continue
         duration = manoeuvre_time(float(np.linalg.norm(np.subtract((x, y, z), begin))), ground.go_to_speed)
         way = _way(begin, (x, y, z), yaw + _TURN, yaw, duration, mission)
         yield f"on the way from {_text(begin)} to the start", _START_HINT, way
@@ -74,6 +86,25 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
     floor, pace = space.low[2], gentle(ground.land_speed)
     down = descent(end, end_yaw, 0.0, pace, floor, floor - _BENEATH_FLOOR, mission.limits, mission.rate)
     yield f"in landing at {_text(end)}", _LANDING_HINT, down
+
+
+def _clear(begin: Triple, end: Triple, space: Space) -> bool:
+    """Return whether a way and all beneath it are clear of obstacles; elsewhere preflight refuses to begin."""
+    if not space.obstacles:
+        return True
+    way = np.linspace(begin, end, _PLACES)
+    return bool(inside(space.above_floor(way)[0], QUANTUM).all())
+
+
+def _require_clear_landing(mission: Mission) -> None:
+    """Raise NotCertifiedError where an obstacle stands beneath the end of the path."""
+    space, (end, _) = mission.limits.space, mission.end
+    if not _clear(end, end, space):
+        (beyond,), (face,) = space.above_floor(np.array([end]))
+        raise NotCertifiedError(
+            f"the landing at {_text(end)} is {beyond:.2f} m too {space.too(face)}",
+            where="landing", hint="end the path above the free floor",
+        )  # fmt: skip
 
 
 def _way(begin: Triple, end: Triple, yaw: float, end_yaw: float, duration: float, mission: Mission) -> NDArray:

@@ -20,12 +20,12 @@ from PIL import Image
 
 from cfplan.files.whole import check_new_file, write_whole
 from cfplan.planning.active_limits import FREE, active_limits
-from cfplan.planning.figure import FLOWN, caption, draw_path, draw_speed, limit_colour
+from cfplan.planning.figure import FLOWN, OBSTACLE, caption, draw_path, draw_speed, limit_colour
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.recording.record import PLAN_FILE, Record
 from cfplan.recording.summary import reference_span
-from cfplan.safety.space import Space
+from cfplan.safety.space import Obstacle, Space, outline
 from cfplan.vehicle.rotations import matrix_of
 
 SUFFIX = ".gif"
@@ -135,12 +135,23 @@ def _draw_still(figure: Figure, plan: Plan, name: str) -> tuple[Any, Axes]:
     handles = [Line2D([], [], color=limit_colour(limit), lw=2.6, label=limit) for limit in limits]
     figure.legend(handles=handles, loc="upper left", bbox_to_anchor=(0.01, 0.94), ncols=5, fontsize=7, frameon=False)
     room = _draw_room(figure, plan.limits.space)
+    for obstacle in plan.limits.space.obstacles:
+        _draw_obstacle(room, obstacle)
     room.plot(*active.position[:, :2].T, plan.limits.space.low[2], color=_PALE, lw=1.4)
     draw_path(room, active, 0, 1, 2)
     curve = figure.add_axes(_CURVE, xlim=(-_BEFORE, plan.trajectory.duration + _AFTER))
     draw_speed(curve, plan, active)
     curve.set(xlabel="time, s", ylim=(0.0, 1.1 * plan.limits.plan.speed))
     return room, curve
+
+
+def _draw_obstacle(room: Any, obstacle: Obstacle) -> None:
+    """Draw foot, top and upright edges of an obstacle."""
+    around, (_, _, z, _, _, tall, _, _) = outline(obstacle), obstacle.prism
+    for height in (z - tall, z + tall):
+        room.plot(*around.T, height, color=OBSTACLE, lw=1.0)
+    for x, y in around[:: max(len(around) // 4, 1)]:
+        room.plot([x, x], [y, y], [z - tall, z + tall], color=OBSTACLE, lw=1.0)
 
 
 def _draw_room(figure: Figure, space: Space) -> Any:

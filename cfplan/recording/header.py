@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.files.json_values import json_value, whole_characters
 from cfplan.safety.limits import Limits, PlanLimits
+from cfplan.safety.space import Box, Cylinder, Obstacle
 from cfplan.vehicle.airframe import Airframe
 from cfplan.version import __version__
 
@@ -59,6 +60,7 @@ class RecordHeader:
     wall_time_at_zero: float  # s since 1970, when time.monotonic() was zero
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Where the plan came from: file, model hash, …"""
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 def header_under(
@@ -88,6 +90,7 @@ def header_under(
         fence=(limits.space.low, limits.space.high),
         wall_time_at_zero=wall_time_at_zero,
         provenance=provenance or {},
+        obstacles=limits.space.obstacles,
     )
 
 
@@ -167,6 +170,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             fence=(_triple(values["fence"][0]), _triple(values["fence"][1])),
             wall_time_at_zero=_number(values["wall_time_at_zero"]),
             provenance={str(key): str(value) for key, value in values["provenance"].items()},
+            obstacles=tuple(map(_obstacle, values.get("obstacles", ()))),
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
         raise InputError(
@@ -174,6 +178,14 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             where=where,
             hint="it was written by another version of cfplan, or is damaged",
         ) from error
+
+
+def _obstacle(values: Mapping[str, Any]) -> Obstacle:
+    name = str(values["name"])
+    if "radius" in values:
+        x, y, radius, low, high = (_number(values[key]) for key in ("x", "y", "radius", "low", "high"))
+        return Cylinder(x, y, radius, low, high, name)
+    return Box(_triple(values["low"]), _triple(values["high"]), _number(values["yaw"]), name)
 
 
 def _airframe(values: Mapping[str, Any]) -> Airframe:

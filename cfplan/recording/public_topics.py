@@ -18,6 +18,7 @@ from mcap_protobuf.schema import register_schema
 
 from cfplan.flight import telemetry
 from cfplan.recording.header import RecordHeader
+from cfplan.safety.space import Obstacle
 
 ROOM, VEHICLE = "room", "vehicle"
 POSE, SETPOINT, TRANSFORM, SCENE, LOG = (f"/public/{name}" for name in ("pose", "setpoint", "tf", "scene", "log"))
@@ -100,6 +101,8 @@ def _scene(header: RecordHeader) -> SceneUpdate:
     for a, b in _edges():
         for corner in (a, b):
             edges.points.add(**{axis: (low, high)[corner[k]][k] for k, axis in enumerate("xyz")})
+    for obstacle in header.obstacles:
+        _add_solid(room, obstacle)
     path = scene.entities.add(frame_id=ROOM, id="path")
     line = path.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.015)
     line.color.g, line.color.b, line.color.a = 0.6, 0.9, 1.0
@@ -112,6 +115,17 @@ def _scene(header: RecordHeader) -> SceneUpdate:
     box.size.z = HEIGHT
     box.color.r, box.color.g, box.color.a = 0.9, 0.6, 1.0
     return scene
+
+
+def _add_solid(room: Any, obstacle: Obstacle) -> None:
+    x, y, z, wide, deep, tall, radius, yaw = obstacle.prism
+    solid = (room.cylinders if radius else room.cubes).add()
+    solid.pose.position.x, solid.pose.position.y, solid.pose.position.z = x, y, z
+    solid.pose.orientation.z, solid.pose.orientation.w = math.sin(yaw / 2), math.cos(yaw / 2)
+    solid.size.x, solid.size.y, solid.size.z = 2 * (wide + radius), 2 * (deep + radius), 2 * tall
+    if radius:
+        solid.bottom_scale = solid.top_scale = 1.0
+    solid.color.r, solid.color.g, solid.color.b, solid.color.a = 0.5, 0.4, 0.3, 1.0
 
 
 def _edges() -> Iterator[tuple[tuple[int, int, int], tuple[int, int, int]]]:

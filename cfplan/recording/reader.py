@@ -106,6 +106,9 @@ def _check_plausible(record: Record, file: Path) -> None:
     check_values(np.array(figures), "the header", where=str(file))
     if not np.isfinite(record.header.fence).all():
         raise InputError("the header's fence is not finite", where=str(file), hint="the record was changed since")
+    prisms = np.array([each.prism for each in header.obstacles]).reshape(-1, 8)
+    check_values(prisms.ravel(), "the header's obstacles", where=str(file))
+    check_places(prisms[:, :3], "the header's obstacles", where=str(file))
     check_places(np.vstack([record.header.path, record.header.fence]), "the header", where=str(file))
 
 

@@ -4,12 +4,13 @@ The trajectory is cut at the grid points of its profile and at the breaks of its
 and each piece is sampled from end to end, closed: at least ten points, and never further apart than a millisecond of
 flight. Both sides of a grid point are thus seen, where h''' and ψ'' jump. Between two samples a smooth quantity exceeds
 the larger of them by at most an eighth of its second difference there; that is added, twice over, to every worst value.
-Where so much is added that a limit's margin would be overstated, samples are taken four times as near, and again.
+Where so much is added that a limit's margin would be overstated, samples are taken four times as near, and again. The
+distance to obstacles is that of the path: see space.py.
 """
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -18,11 +19,12 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
 from cfplan.numbers import shown
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
-from cfplan.safety.space import Space, inside
+from cfplan.safety.space import Space, beyond_obstacles, inside
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
@@ -36,7 +38,8 @@ BATCH = 1_000  # samples at a time, about: as many as stay near the processor
 BLOCK = 512  # samples searched for a peak at once
 _INTERPRETED_BATCHES = 20  # as many times as many where samples are taken with numpy
 LEAST_POINTS = 11  # of a piece, its ends included
-WALLS = "distance to the walls"
+WALLS, OBSTACLES = "distance to the walls", "distance to obstacles"
+OF_PLACE = (WALLS, OBSTACLES)  # which the path decides, however fast it is flown
 CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
 _MOST_ADDED = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
@@ -138,6 +141,8 @@ def certify(
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     margins = [_margin(*each) for each in peaks]
+    if space is not None and space.obstacles:
+        margins.append(obstacle_margin(trajectory.path, space, trajectory.time_at))
     if caps is not None:
         margins.append(_capped_speed(trajectory, caps, segments))
     return Certificate(
@@ -163,9 +168,8 @@ def _bounds(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tupl
     """Return the limits that bind; and for compiled code, (Q, 3), the first row of each, how many, and its side."""
     bounds = [_Bound(q, q.allowed(limits), q.unused(airframe)) for q in QUANTITIES if q.allowed(limits) != math.inf]
     if space is not None:
-        half = float((np.array(space.high) - np.array(space.low)).min()) / 2
         walls = Quantity(WALLS, "m", "", "", AT_LEAST, dense.POSITION, 3)  # in place of the position itself
-        bounds.append(_Bound(walls, space.margin, half))
+        bounds.append(_Bound(walls, space.margin, half_of(space)))
     return tuple(bounds), np.array([(q.measure, q.count, q.side) for q, _, _ in bounds])
 
 
@@ -199,10 +203,24 @@ def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequenc
 
 
 def share_of(quantity: Quantity, worst: float, limit: float, unused: float) -> float:
-    """Return the usage of a limit; for the walls it is at most 1 if the margin is kept within rounding."""
+    """Return the usage of a limit; of a distance it is at most 1 if the margin is kept within rounding."""
     room = limit - unused
     share = (worst - unused) / room if room * quantity.side > 0 else math.inf
-    return min(share, 1.0) if quantity.name == WALLS and inside(limit - worst) else share
+    return min(share, 1.0) if quantity.name in OF_PLACE and inside(limit - worst) else share
+
+
+def half_of(space: Space) -> float:
+    """Return the distance from walls and obstacles, m, that counts as usage 0: half the room's least size."""
+    return float(np.subtract(space.high, space.low).min()) / 2
+
+
+def obstacle_margin(path: Path, space: Space, time_at: Callable[[NDArray], Any]) -> Margin:
+    """Return the margin of a path's distance to obstacles, flown at s at the times that `time_at` returns, s."""
+    s, beyond = beyond_obstacles(path, space)
+    worst = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
+    bound = _Bound(Quantity(OBSTACLES, "m", "", "", AT_LEAST, dense.POSITION, 1), space.margin, half_of(space))
+    place, peak = s[worst], float(beyond[worst]) - space.margin
+    return _margin(bound, peak, float(time_at(place)), float(place), path(place).tolist())
 
 
 def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -> Margin:

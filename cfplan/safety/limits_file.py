@@ -1,8 +1,9 @@
 """safety.yaml, read strictly: every mistake is named with its line and column."""
 
 import math
-from dataclasses import dataclass, fields
-from functools import lru_cache
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -26,7 +27,7 @@ from cfplan.safety.limits import (
     within_reserve,
 )
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.safety.space import Space, inside
+from cfplan.safety.space import SIDES, Box, Cylinder, Space, inside
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
@@ -40,6 +41,8 @@ _LEAST_PLANNED = {
     "angular_acceleration": 0.05,
 }
 """What a limit of planned motion must allow at least: noise of the gyroscope and of poses would hide slower motion."""
+
+_LOOKED_AT = 65  # places along the room and across it where a take-off may end
 
 _QUARTER_TURN = math.pi / 2  # a limit of tilt below so many degrees is taken for radians
 
@@ -87,10 +90,30 @@ class _Flight(_Section):
         return [name for name, field in cls.model_fields.items() if field.annotation is _Ladder]
 
 
+class _Box(_Section):
+    low: Corner
+    high: Corner
+    yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+
+
+class _Cylinder(_Section):
+    x: Coordinate
+    y: Coordinate
+    radius: Encodable
+    height: Encodable
+
+
+class _Obstacle(_Section):
+    name: Annotated[str, StringConstraints(min_length=1, max_length=40)] = ""
+    box: _Box | None = None
+    cylinder: _Cylinder | None = None
+
+
 class _Space(_Section):
     low: Corner
     high: Corner
     margin: Positive
+    obstacles: Annotated[tuple[_Obstacle, ...], Field(max_length=1000)]
 
 
 class _Battery(_Section):
@@ -185,7 +208,9 @@ def _range(kind: dict[str, Any]) -> str:
     if kind["type"] == "string":
         return "text"
     if kind["type"] == "array":
-        least, most = kind["minItems"], kind["maxItems"]
+        least, most = kind.get("minItems", 0), kind["maxItems"]
+        if "$ref" in kind.get("items", {}):
+            return f"{least} to {most} entries"
         each = _range(kind["items"] if "items" in kind else kind["prefixItems"][0])
         return f"{least} to {most}, each {each}" if least < most else f"{most} numbers, each {each}"
     if "minimum" in kind:
@@ -247,7 +272,7 @@ def load_limits(file: Path | str) -> Limits:
         airframe=airframe,
         plan=_plan_limits(content.plan, airframe),
         flight=_made(FlightLimits, content.flight, stop_tilt=math.radians(content.flight.stop_tilt_deg)),
-        space=_made(Space, content.space),
+        space=_space(content.space),
         battery=_made(BatteryLimits, content.battery),
         pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
         firmware=_made(
@@ -266,6 +291,7 @@ def load_limits(file: Path | str) -> Limits:
         ),
         lateness=content.lateness,
     )
+    _check_obstacles(limits, places)
     _check_vehicle_can(limits, places)
     return limits
 
@@ -277,6 +303,17 @@ def _vehicle(name: str, folder: Path, places: Places) -> Airframe:
         if error.where:
             raise
         raise InputError(error.what, where=places.where("vehicle"), hint=error.hint) from None
+
+
+def _space(section: _Space) -> Space:
+    obstacles: list[Box | Cylinder] = []
+    for each in section.obstacles:
+        if box := each.box:
+            obstacles.append(Box(box.low, box.high, math.radians(box.yaw_deg), each.name))
+        if round_ := each.cylinder:
+            foot = section.low[2]
+            obstacles.append(Cylinder(round_.x, round_.y, round_.radius, foot, foot + round_.height, each.name))
+    return _made(Space, section, obstacles=tuple(obstacles))
 
 
 def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
@@ -334,6 +371,8 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
                 where=places.where("space", "high", axis),
                 hint="lower the margin, or name a larger space, from its low corner to its high one",
             )
+    for number, obstacle in enumerate(content.space.obstacles):
+        _check_obstacle(obstacle, partial(places.where, "space", "obstacles", number))
     if not content.battery.under_load < content.battery.at_rest:
         raise InputError(
             "battery.under_load must be below battery.at_rest",
@@ -373,6 +412,52 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             where=places.where("ground", "take_off_height"),
             hint=f"write a height from {low + margin:g} to {high - margin:g} m",
         )
+
+
+def _check_obstacle(obstacle: _Obstacle, where: Callable[..., str]) -> None:
+    if (obstacle.box is None) == (obstacle.cylinder is None):
+        raise InputError(
+            "an obstacle is either a box or a cylinder",
+            where=where(),
+            hint="write `box: {low: [x, y, z], high: [x, y, z]}` or `cylinder: {x: 0, y: 1, radius: 0.1, height: 2}`",
+        )
+    if obstacle.box is None:
+        return
+    for axis, (low, high) in enumerate(zip(obstacle.box.low, obstacle.box.high, strict=True)):
+        if not low < high:
+            raise InputError(
+                f"the box from {low:g} to {high:g} m in {'xyz'[axis]} has no inside",
+                where=where("box", "high", axis),
+                hint="give its low corner and its high one; each coordinate of `low` is the smaller",
+            )
+
+
+def _check_obstacles(limits: Limits, places: Places) -> None:
+    """Refuse obstacles that are not in the room, and those that leave no place to hover after take-off."""
+    space = limits.space
+    if not space.obstacles:
+        return
+    middle, half = np.add(space.low, space.high) / 2, np.subtract(space.high, space.low) / 2
+    reach = space.beyond(middle, half)[SIDES:] - space.margin  # the room is a box: positive where it meets an obstacle
+    if not (reach > 0.0).all():
+        number = int(np.argmin(reach))
+        raise InputError(
+            f"{space.faces[SIDES + number]} is not in the room",
+            where=places.where("space", "obstacles", number),
+            hint="give its place in metres, in the frame of motion capture; leave it out where it is in another room",
+        )
+    room = replace(space, obstacles=())
+    x, y = (np.linspace(low, high, _LOOKED_AT) for low, high in zip(space.low[:2], space.high[:2], strict=True))
+    floor = np.stack(np.broadcast_arrays(x[:, None], y, limits.ground.take_off_height), axis=-1)
+    for row in floor:
+        clear = row[inside(room.beyond(row)).all(axis=1)]
+        if inside(space.beyond(clear)).all(axis=1).any():
+            return
+    raise InputError(
+        f"the obstacles, each with the margin of {space.margin:g} m about it, leave no place to take off to",
+        where=places.where("space", "obstacles"),
+        hint="give only what stands in the room, or lower the margin; a room that is furnished is a smaller `space`",
+    )
 
 
 def _check_vehicle_can(limits: Limits, places: Places) -> None:

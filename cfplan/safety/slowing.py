@@ -7,7 +7,7 @@ import numpy as np
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.numbers import coordinates, shown
-from cfplan.safety.certificate import WALLS, Certificate, certify
+from cfplan.safety.certificate import OBSTACLES, OF_PLACE, Certificate, certify
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import QUANTITIES
@@ -86,7 +86,7 @@ def slow_until_certified(
 
 def _excess(certificate: Certificate) -> float:
     """Return the largest usage of a limit that slowing changes, less 1; infinity for NaN (no thrust, upside down)."""
-    usages = [margin.share for margin in certificate.margins if margin.name != WALLS]
+    usages = [margin.share for margin in certificate.margins if margin.name not in OF_PLACE]
     return np.inf if np.isnan(usages).any() else max(usages) - 1.0
 
 
@@ -102,9 +102,10 @@ def _check_hover(airframe: Airframe, limits: PlanLimits) -> None:
 
 def _check_place(certificate: Certificate) -> None:
     for margin in certificate.margins:
-        if margin.name == WALLS and not margin.passed:
+        if margin.name in OF_PLACE and not margin.passed:
+            what = "an obstacle" if margin.name == OBSTACLES else "the walls"
             raise InfeasibleError(
-                f"the path comes within {shown(margin.worst, '.3f')} m of the walls, the margin is {margin.limit:g} m",
+                f"the path comes within {shown(margin.worst, '.3f')} m of {what}, the margin is {margin.limit:g} m",
                 where=f"{coordinates(margin.position, '.2f')} m",
                 hint="move or place the path",
             )

@@ -1,51 +1,282 @@
-"""The space to fly in, and the check that a path stays within it."""
+"""The space to fly in, the obstacles in it, and the check that a path stays clear of its faces.
 
-from dataclasses import dataclass
-from typing import Any
+A face is a wall, the floor, the ceiling, or the surface of an obstacle; plans keep the same margin from each.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.path import Path
-from cfplan.numbers import coordinates
+from cfplan.numbers import coordinates, shown
 
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
+FLOOR = 2  # its number among the faces
+SIDES = 6  # faces of the room itself, with floor and ceiling; obstacles come behind
 TOLERANCE = 1e-6
 """m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
 packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
+_BLOCK = 16  # positions that follow one another, about which a box may tell enough
+_ROUND = 33  # points around a cylinder that is drawn
+_TOGETHER = 256  # positions, for which obstacles far from all of them are left out
+_PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
+_WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
 
 
 def inside(beyond: ArrayLike, rounding: float = 0.0) -> Any:
-    """Return whether positions count as inside that are `beyond` a wall, or a margin before it, m; NaN does not.
+    """Return whether positions count as inside that are `beyond` a face, or a margin before it, m; NaN does not.
 
-    All comparisons with walls use this function. `rounding`, m, is by how much the positions were rounded before.
+    All comparisons with walls and obstacles use this function. `rounding`, m, is by how much the positions were rounded
+    before.
     """
     return np.asarray(beyond) <= TOLERANCE + rounding
 
 
 @dataclass(frozen=True, slots=True)
+class Box:
+    """An obstacle between two corners, turned by `yaw` about the vertical through its middle."""
+
+    low: tuple[float, float, float]  # m
+    high: tuple[float, float, float]  # m
+    yaw: float = 0.0  # rad
+    name: str = ""
+
+    @property
+    def prism(self) -> tuple[float, ...]:
+        """Return its row in the table of prisms."""
+        middle, half = np.add(self.low, self.high) / 2, np.subtract(self.high, self.low) / 2
+        return (*middle.tolist(), *half.tolist(), 0.0, self.yaw)
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """A vertical, round obstacle."""
+
+    x: float  # m
+    y: float  # m
+    radius: float  # m
+    low: float  # m, z of its foot
+    high: float  # m, z of its top
+    name: str = ""
+
+    @property
+    def prism(self) -> tuple[float, ...]:
+        """Return its row in the table of prisms."""
+        return (self.x, self.y, (self.low + self.high) / 2, 0.0, 0.0, (self.high - self.low) / 2, self.radius, 0.0)
+
+
+Obstacle = Box | Cylinder
+
+
+def outline(obstacle: Obstacle) -> NDArray:
+    """Return an obstacle as it is seen from above, (N, 2) m, as a closed polygon."""
+    x, y, _, a, b, _, radius, yaw = obstacle.prism
+    turn = np.linspace(0.0, 2.0 * np.pi, _ROUND) if radius else np.pi * (np.arange(5) / 2 + 0.25)
+    flat = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    own = radius * flat if radius else np.sign(flat) * (a, b)
+    return np.array([x, y]) + own @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
+@dataclass(frozen=True, slots=True)
 class Space:
-    """A box, and the distance that plans keep from its walls."""
+    """A box, the obstacles in it, and the distance that plans keep from its walls and from these."""
 
     low: tuple[float, float, float]  # m
     high: tuple[float, float, float]  # m
     margin: float  # m, positive
+    obstacles: tuple[Obstacle, ...] = ()
 
-    def beyond(self, positions: ArrayLike) -> NDArray:
-        """Return (N, 3) m: how far each coordinate lies beyond the box less its margin; negative inside."""
+    def beyond(self, positions: ArrayLike, half: ArrayLike = 0.0) -> NDArray:
+        """Return (..., 6 + K) m: how far positions, (..., 3) m, are beyond each face less its margin; negative: clear.
+
+        The faces are in the order of `faces`. Of an obstacle it is the margin less the distance from it, which is
+        negative within it. `half`, (..., 3) m, is half the size of a box about each position that is to be clear.
+        """
+        points, half = np.asarray(positions, dtype=float), np.asarray(half, dtype=float)
+        walls = [
+            np.array(self.low) + self.margin - (points - half),
+            points + half - (np.array(self.high) - self.margin),
+        ]
+        if not self.obstacles:
+            return np.concatenate(walls, axis=-1)
+        around = half[..., None, :] if half.ndim else half
+        return np.concatenate(
+            [*walls, self.margin - _distances(_prisms(self.obstacles), points[..., None, :], around)], axis=-1
+        )
+
+    def nearest(self, positions: ArrayLike, half: ArrayLike = 0.0, *, floor: bool = True) -> tuple[NDArray, NDArray]:
+        """Return, (N,) each, how far positions, (N, 3) m, are beyond the face where that is most, m, and its number.
+
+        As the largest of beyond(), in less time and memory where there are many obstacles. The floor may be left out.
+        """
         points = np.asarray(positions, dtype=float)
-        return np.maximum(np.array(self.low) + self.margin - points, points - (np.array(self.high) - self.margin))
+        sizes = np.broadcast_to(np.asarray(half, dtype=float), points.shape)
+        room = replace(self, obstacles=()).beyond(points, sizes)
+        if not floor:
+            room[:, FLOOR] = -np.inf
+        most, face = room.max(axis=1), room.argmax(axis=1)
+        if not self.obstacles:
+            return most, face
+        prisms = _prisms(self.obstacles)
+        for begin in range(0, len(points), _TOGETHER):
+            some = slice(begin, begin + _TOGETHER)
+            near = _near(prisms, points[some], sizes[some])
+            away = _distances(prisms.only(near), points[some, None], sizes[some, None])
+            which = away.argmin(axis=1)
+            beyond = self.margin - away[np.arange(len(away)), which]
+            closer = ~(beyond <= most[some])  # NaN is the worst
+            most[some] = np.where(closer, beyond, most[some])
+            face[some] = np.where(closer, SIDES + near[which], face[some])
+        return most, face
+
+    def farthest(self, positions: NDArray) -> float:
+        """Return how far the worst of positions, (N, 3) m, is beyond a face less its margin, m.
+
+        Made for many that follow a way. Where all are clear, obstacles may be farther off than it says.
+        """
+        if not self.obstacles:
+            return float(self.beyond([positions.min(axis=0), positions.max(axis=0)]).max())
+        begins = np.arange(0, len(positions), _BLOCK)
+        low, high = np.minimum.reduceat(positions, begins), np.maximum.reduceat(positions, begins)
+        bound, _ = self.nearest((low + high) / 2, (high - low) / 2)
+        near = ~(bound <= 0.0)
+        if not near.any():
+            return float(bound.max())
+        exact, _ = self.nearest(positions[np.repeat(near, np.diff(begins, append=len(positions)))])
+        return float(max(exact.max(), bound[~near].max(initial=-np.inf)))
+
+    def above_floor(self, positions: NDArray) -> tuple[NDArray, NDArray]:
+        """Return, as nearest(), how far the columns between the floor and positions, (N, 3) m, are beyond a face."""
+        half = 0.5 * (positions[:, 2] - self.low[2])
+        columns = np.stack([positions[:, 0], positions[:, 1], positions[:, 2] - half], axis=1)
+        return self.nearest(columns, np.stack([0.0 * half, 0.0 * half, half], axis=1), floor=False)
+
+    def swept(self, boxes: NDArray) -> tuple[NDArray, NDArray]:
+        """Return, (N,) each, how far vehicles come beyond a face, m, without its margin, and which is the worst.
+
+        `boxes`, (N, S, 2, 3) m, are what each sweeps on its way to the floor, which therefore does not count, in S
+        parts.
+        """
+        low, high = boxes[:, :, 0].reshape(-1, 3), boxes[:, :, 1].reshape(-1, 3)
+        beyond, face = (
+            each.reshape(boxes.shape[:2]) for each in self.nearest((low + high) / 2, (high - low) / 2, floor=False)
+        )
+        number, worst = np.arange(len(boxes)), beyond.argmax(axis=1)
+        return beyond[number, worst] - self.margin, face[number, worst]
+
+    def describe(self, beyond: float, face: int) -> str:
+        """Return where a place is that is so far, m, beyond a face: "0.12 m beyond the wall x = 2 m"."""
+        clear, past = ("from", "into") if face >= SIDES else ("inside", "beyond")
+        return f"{abs(beyond):.2f} m {clear if inside(beyond) else past} {self.faces[face]}"
+
+    def too(self, face: int) -> str:
+        """Return what a place is that is beyond a face less its margin: "far out", "near the obstacle 'table'"."""
+        return f"near {self.faces[face]}" if face >= SIDES else "far out"
 
     def holds(self, positions: ArrayLike, rounding: float = 0.0) -> bool:
-        """Return whether all positions, (..., 3) m, are inside the box less its margin; see inside()."""
+        """Return whether all positions, (..., 3) m, keep the margin from all faces; see inside()."""
         return bool(np.all(inside(self.beyond(positions), rounding)))
+
+    @property
+    def faces(self) -> tuple[str, ...]:
+        """Return what people call each of the 6 + K faces: "the wall x = 2 m", "the obstacle 'table'"."""
+        named = (
+            f"the obstacle {each.name!r}" if each.name else f"obstacle {number}"
+            for number, each in enumerate(self.obstacles, start=1)
+        )
+        return (*_walls(self.low, "floor"), *_walls(self.high, "ceiling"), *named)
+
+
+def _walls(corner: tuple[float, float, float], level: str) -> list[str]:
+    kinds = ("wall", "wall", level)
+    return [f"the {kind} {axis} = {shown(at, 'g')} m" for kind, axis, at in zip(kinds, _AXES, corner, strict=True)]
+
+
+class _Prisms(NamedTuple):
+    """Upright prisms: rectangles whose sides are pushed out by a radius, from z - half to z + half."""
+
+    middle: NDArray  # (K, 3) m
+    half: NDArray  # (K, 3) m
+    radius: NDArray  # (K,) m
+    cos: NDArray  # (K,) of the yaw
+    sin: NDArray  # (K,)
+
+    def only(self, numbers: NDArray) -> "_Prisms":
+        """Return those with these numbers."""
+        return _Prisms(*(values[numbers] for values in self))
+
+    def of_rows(self, numbers: NDArray) -> "_Prisms":
+        """Return one for each of P rows of points, (P, N, 3)."""
+        return _Prisms(*(values[numbers][:, None] for values in self))
+
+
+@lru_cache(maxsize=8)
+def _prisms(obstacles: tuple[Obstacle, ...]) -> _Prisms:
+    """Return obstacles in one form, of which a box has no radius, and of a cylinder the rectangle is a point."""
+    table = np.array([each.prism for each in obstacles])
+    return _Prisms(table[:, :3], table[:, 3:6], table[:, 6], np.cos(table[:, 7]), np.sin(table[:, 7]))
+
+
+def _offsets(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> tuple[NDArray, NDArray]:
+    """Return places in each prism's own axes, and how far they are beyond its rectangle and its height, (..., K, 3)."""
+    x, y, z = np.moveaxis(points - prisms.middle, -1, 0)
+    own = np.stack([prisms.cos * x + prisms.sin * y, prisms.cos * y - prisms.sin * x, z], axis=-1)
+    a, b, c = np.moveaxis(np.broadcast_to(half, (*np.shape(half)[:-1], 3)), -1, 0)
+    cos, sin = np.abs(prisms.cos), np.abs(prisms.sin)
+    size = np.stack(np.broadcast_arrays(cos * a + sin * b, cos * b + sin * a, c), axis=-1)
+    return own, np.abs(own) - (prisms.half + size)
+
+
+def _joined(a: NDArray, b: NDArray) -> NDArray:
+    """Return the distance from a corner whose two sides are so far away: Euclidean outside, to the nearer inside."""
+    return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0)
+
+
+def _distances(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> NDArray:
+    """Return the signed distance, m, of points, (..., 1, 3) or (..., K, 3), from each prism, (..., K).
+
+    It is a convex function of the place. `half` is half the size of boxes about the points, whose distance it is; from
+    a turned prism at most their distance.
+    """
+    _, over = _offsets(prisms, points, half)
+    return _joined(_joined(over[..., 0], over[..., 1]) - prisms.radius, over[..., 2])
+
+
+def _near(prisms: _Prisms, points: NDArray, half: NDArray) -> NDArray:
+    """Return the numbers of the prisms among which the nearest of each point, (N, 3), is."""
+    low, high = (points - half).min(axis=0), (points + half).max(axis=0)
+    reach = float(np.linalg.norm(high - low)) / 2
+    away = _distances(prisms, (low + high) / 2)
+    return np.flatnonzero(~(away > away.min() + 2.0 * reach))
+
+
+def _distances_with_slopes(prisms: _Prisms, points: NDArray) -> tuple[NDArray, NDArray]:
+    """Return signed distances, and their slope by place, (..., K, 3): of a corner, that of one of its sides."""
+    own, over = _offsets(prisms, points)
+    sign = np.sign(own)
+    flat, to_sides = _slope(over[..., 0], over[..., 1])
+    distance, to_ends = _slope(flat - prisms.radius, over[..., 2])
+    u, v = (to_ends[0] * side * sign[..., axis] for axis, side in enumerate(to_sides))
+    out = [prisms.cos * u - prisms.sin * v, prisms.sin * u + prisms.cos * v, to_ends[1] * sign[..., 2]]
+    return distance, np.stack(out, axis=-1)
+
+
+def _slope(a: NDArray, b: NDArray) -> tuple[NDArray, tuple[NDArray, NDArray]]:
+    """Return _joined(), and its derivatives."""
+    joined, outside = _joined(a, b), np.maximum(a, b) > 0.0
+    size = np.where(outside, joined, 1.0)
+    by_a = np.where(outside, np.maximum(a, 0.0) / size, a >= b)
+    return joined, (by_a, np.where(outside, np.maximum(b, 0.0) / size, a < b))
 
 
 def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None, where: str = "") -> None:
-    """Refuse a path that leaves the space or its margin anywhere, at waypoints or between them.
+    """Refuse a path that leaves the space, or comes within the margin of a face, at waypoints or between them.
 
     Raises:
         InfeasibleError: naming the first waypoint at fault, else the worst place, and by how much.
@@ -69,33 +300,136 @@ def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None,
 
 
 def distances_beyond(path: Path, space: Space) -> tuple[NDArray, NDArray]:
-    """Return s, (M, N), along each of the M pieces, and how far the path lies beyond the space around there, (M, N) m.
+    """Return s, (M, N), along each of the M pieces, and how far the path is beyond the space around there, (M, N) m.
 
-    The distance is that of the worst coordinate from the box less its margin, negative inside. It holds between the
-    samples too, where a coordinate exceeds both by at most step² / 8 of its second derivative.
+    The distance is that of the worst face less its margin, negative inside. It holds between the samples too, where a
+    coordinate exceeds both by at most step² / 8 of its second derivative; s is where about it is the worst.
     """
-    s = path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES)
-    bend = np.abs(path(s, 2)).max(axis=1)
+    s = _samples(path)
+    places, bend = path(s), np.abs(path(s, 2)).max(axis=1)
     step = np.diff(path.breaks) / (_SAMPLES - 1)
     between = (step[:, None] ** 2 / 8 * bend)[:, None]
-    return s, (space.beyond(path(s)) + between).max(axis=-1)
+    room = replace(space, obstacles=())
+    beyond = (room.beyond(places) + np.concatenate([between, between], axis=-1)).max(axis=-1)
+    if not space.obstacles:
+        return s, beyond
+    at, near = beyond_obstacles(path, space)
+    return np.where(near > beyond, at, s), np.maximum(near, beyond)
+
+
+class _Stretches(NamedTuple):
+    """Stretches of a path beside one obstacle each."""
+
+    cell: NDArray  # (C,) int: which value of the answer each belongs to
+    piece: NDArray  # (C,) int
+    obstacle: NDArray  # (C,) int
+    ends: NDArray  # (C, 2): s
+    least: NDArray  # (C,) m, how far it is beyond that obstacle less its margin somewhere
+    most: NDArray  # (C,) m, how far it is so at most
+    worst: NDArray  # (C,) about the s where it is
+
+    def some(self, which: NDArray) -> "_Stretches":
+        """Return some of them."""
+        return _Stretches(*(values[which] for values in self))
+
+
+def _samples(path: Path) -> NDArray:
+    """Return (M, N) s, of each piece."""
+    return np.asarray(path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * np.linspace(0.0, 1.0, _SAMPLES))
+
+
+@lru_cache(maxsize=16)
+def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
+    """Return s, (M, N), and at most how far the path is beyond an obstacle less its margin around there, (M, N) m.
+
+    As distances_beyond(), of a space that has obstacles. Along a chord of the path a distance is convex, so it is
+    nowhere below its tangents at both ends, and the path is no farther from the chord than step² / 8 of its second
+    derivative. Where that does not decide, a stretch is cut into shorter ones.
+    """
+    s = _samples(path)
+    places, bend = path(s), np.linalg.norm(path(s, 2), axis=-1).max(axis=1)
+    prisms, count = _prisms(space.obstacles), s.shape[1]
+    middle = places[:, count // 2]
+    around = np.linalg.norm(places - middle[:, None], axis=-1).max(axis=1)
+    around += (np.diff(path.breaks) / (count - 1)) ** 2 / 8 * bend
+    seen = space.margin - _distances(prisms, middle[:, None])
+    most = seen + around[:, None]  # as a distance changes by no more than the place
+    close = ~(most <= min(seen.max(), 0.0))
+    at = s.copy()
+    beyond = np.repeat(np.where(close, -np.inf, most).max(axis=1)[:, None], count, axis=1)
+    piece, obstacle = np.nonzero(close)
+    cell = piece[:, None] * count + np.arange(count)
+    stretches = _cut(path, space, prisms, bend, cell[:, :-1], piece, obstacle, s[piece])
+    reached = seen.max()
+    for level in range(_LEVELS):
+        reached = max(reached, stretches.least.max(initial=-np.inf))
+        open_ = ~inside(stretches.most) & inside(stretches.least) | (stretches.most > reached + _WORST)
+        open_ &= level < _LEVELS - 1
+        _raise(at, beyond, stretches.some(~open_))
+        if not open_.any():
+            break
+        coarse = stretches.some(open_)
+        nodes = coarse.ends[:, :1] + np.diff(coarse.ends, axis=1) * np.linspace(0.0, 1.0, _PARTS + 1)
+        cell = np.repeat(coarse.cell[:, None], _PARTS, axis=1)
+        stretches = _cut(path, space, prisms, bend, cell, coarse.piece, coarse.obstacle, nodes)
+    at[:, -1], beyond[:, -1] = at[:, -2], beyond[:, -2]
+    for each in (at, beyond):
+        each.setflags(write=False)
+    return at, beyond
+
+
+def _cut(
+    path: Path,
+    space: Space,
+    prisms: _Prisms,
+    bend: NDArray,
+    cell: NDArray,
+    piece: NDArray,
+    obstacle: NDArray,
+    nodes: NDArray,
+) -> _Stretches:
+    """Return the stretches between nodes, (P, n) s, for `cell`, (P, n - 1), beside the obstacle of each row."""
+    places = path(nodes)
+    distance, slope = _distances_with_slopes(prisms.of_rows(obstacle), places)
+    way = np.diff(places, axis=1)
+    begin, end = distance[:, :-1], distance[:, 1:]
+    falls, rises = (slope[:, :-1] * way).sum(axis=-1), (slope[:, 1:] * way).sum(axis=-1)
+    dips = (falls < 0.0) & (rises > 0.0)  # between the ends: where the tangents meet
+    share = np.clip((end - rises - begin) / np.where(dips, falls - rises, 1.0), 0.0, 1.0)
+    share = np.where(dips, share, falls < 0.0)
+    lowest = np.where(dips, begin + share * falls, np.where(falls < 0.0, end, begin))
+    step = np.diff(nodes, axis=1)
+    most = space.margin - lowest + step**2 / 8 * bend[piece][:, None]
+    least = space.margin - np.minimum(begin, end)
+    worst = nodes[:, :-1] + share * step
+    ends = np.stack([nodes[:, :-1], nodes[:, 1:]], axis=-1)
+    across = np.ones(step.shape[1], dtype=int)
+    return _Stretches(
+        cell.ravel(), np.outer(piece, across).ravel(), np.outer(obstacle, across).ravel(), ends.reshape(-1, 2),
+        least.ravel(), most.ravel(), worst.ravel(),
+    )  # fmt: skip
+
+
+def _raise(at: NDArray, beyond: NDArray, stretches: _Stretches) -> None:
+    """Write what stretches say into `beyond`, (M, N) m, where it is more, and `at`, (M, N) s."""
+    order = np.argsort(stretches.most)  # of several for one cell the last one stays
+    cell, most = stretches.cell[order], stretches.most[order]
+    more = most > beyond.ravel()[cell]
+    np.put(at, cell[more], stretches.worst[order][more])
+    np.put(beyond, cell[more], most[more])
 
 
 def _refuse(space: Space, point: NDArray, what: str, where: str) -> None:
     beyond = space.beyond(point)
-    axis = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
-    low = bool(point[axis] < (space.low[axis] + space.high[axis]) / 2)
-    outside = beyond[axis] - space.margin
-    far = f"{outside:.3f} m beyond" if outside > 0 else f"{abs(outside):.3f} m from"
+    face = int(np.argmax(np.where(np.isfinite(beyond), beyond, np.inf)))
+    outside = beyond[face] - space.margin
+    obstacle = face >= SIDES
+    past, too = ("inside", "near") if obstacle else ("beyond", "far")
+    far = f"{outside:.3f} m {past}" if outside > 0 else f"{abs(outside):.3f} m from"
+    hint = "move or place the path, or correct `space` in safety.yaml if the room is larger"
     raise InfeasibleError(
-        f"{what}, {coordinates(point, '.3f')} m, is {far} {_side(space, axis, low)}, "
-        f"{max(beyond[axis], 0.0):.3f} m too far with the margin of {space.margin:g} m",
+        f"{what}, {coordinates(point, '.3f')} m, is {far} {space.faces[face]}, "
+        f"{max(beyond[face], 0.0):.3f} m too {too} with the margin of {space.margin:g} m",
         where=where,
-        hint="move or place the path, or correct `space` in safety.yaml if the room is larger",
+        hint="lead the path around it, or correct `space.obstacles` in safety.yaml" if obstacle else hint,
     )
-
-
-def _side(space: Space, axis: int, low: bool) -> str:
-    """Return what people call a side of the box."""
-    name = ("the floor" if low else "the ceiling") if axis == 2 else "the wall"
-    return f"{name} {_AXES[axis]} = {(space.low if low else space.high)[axis]:g} m"

@@ -5,6 +5,9 @@ that setpoint, levels out, settles, and its motors stop; or they stop at once. W
 that `wrong` makes widens: (4,), a push to a side, m/s², the damping of that motion, 1/s, an error of the vertical
 acceleration, m/s², and a speed to a side, m/s. The bodies after the setpoint, (1 + F, 13), are that of the vehicle
 which goes on alone and those of the ones that fall.
+
+Where obstacles matter, the sweep is cut into several boxes, each for PART s after the setpoint and the last for the
+rest: one box about a way aslant holds much that the vehicle does not come to.
 """
 
 import numpy as np
@@ -53,6 +56,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import axes_of
 
 PUSH, DAMPING, LIFT, DRIFT = range(4)  # as what the vehicle has wrong is packed
+PART = 0.15  # s of a sweep, for which a box is its own
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
 _SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
 _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
@@ -91,7 +95,7 @@ def leave_alone_in_stops(
 ) -> None:
     """Fly stops, (K, M, 20), each from a snapshot, (K, 31); leave the vehicle alone where `forks`, (K, M), says so.
 
-    Written are the boxes, (F, 2, 3), of one fork after another.
+    Written are the boxes, (F, S, 2, 3), of one fork after another.
     """
     length = stops.shape[1]
     snapshots, setpoints = np.empty((WIDTH * length, SNAPSHOT_SIZE)), np.empty((WIDTH * length, SETPOINT_SIZE))
@@ -151,14 +155,19 @@ def leave_alone(
     off_after: int,
     wrong: NDArray,
 ) -> None:
-    """Write the boxes, (F, 2, 3), that vehicles sweep from snapshots, (F, 31), with their last setpoints, (F, 20)."""
+    """Write the boxes, (F, S, 2, 3), that vehicles sweep from snapshots, (F, 31), with their last setpoints, (F, 20).
+
+    Each is of a part of the time, and all hold something.
+    """
     panel, spare, which = new_panel(), np.empty((WIDTH, SNAPSHOT_SIZE)), np.empty(WIDTH, dtype=np.int64)
     the_gains = unpacked_gains(gains)
     for first in range(0, len(snapshots), WIDTH):
         count = min(WIDTH, len(snapshots) - first)
         for n in range(first, first + count):
             for axis in range(3):
-                swept[n, 0, axis] = swept[n, 1, axis] = snapshots[n, axis]
+                swept[n, 0, 0, axis] = swept[n, 0, 1, axis] = snapshots[n, axis]
+                for part in range(1, swept.shape[1]):
+                    swept[n, part, 0, axis], swept[n, part, 1, axis] = np.inf, -np.inf
         for falling in range(1, len(later_bodies)):
             _put_in(panel, which, swept, snapshots, first, count)
             _fall(swept, panel, which, count, unpacked_body(later_bodies[falling]), later_bodies[falling], spare)
@@ -169,38 +178,71 @@ def leave_alone(
             swept, panel, which, count, the_gains, gains, unpacked_body(later_bodies[0]), later_bodies[0], level_after,
             off_after, wrong, spare,
         )  # fmt: skip
+        for n in range(first, first + count):
+            for part in range(1, swept.shape[1]):
+                if swept[n, part, 0, 0] == np.inf:  # it was on the floor before
+                    swept[n, part] = swept[n, part - 1]
+
+
+@register_jitable(forceinline=True)
+def _part(swept: NDArray, time: float) -> int:
+    """Return the number of the box of a time, s after the setpoint."""
+    return min(int(time / PART + 1e-6), swept.shape[1] - 1)
 
 
 @register_jitable
 def _put_in(panel: NDArray, which: NDArray, swept: NDArray, snapshots: NDArray, first: int, count: int) -> None:
-    """Write vehicles with their boxes into a panel, and `which` branch is at each place."""
+    """Write vehicles with their first boxes into a panel, and `which` branch is at each place."""
     for n in range(count):
         which[n] = first + n
         write_snapshot(panel, n, snapshots[first + n])
-        for k in range(3):
-            panel[(OWN + k) * WIDTH + n], panel[(OWN + 3 + k) * WIDTH + n] = (
-                swept[first + n, 0, k],
-                swept[first + n, 1, k],
-            )
+        _write_box(panel, n, swept[first + n, 0])
 
 
 @register_jitable
-def _take_out(swept: NDArray, panel: NDArray, which: NDArray, n: int, lanes: int) -> int:
-    """Write the box of the vehicle at place n, and put the last one there; return how many are left."""
+def _write_box(panel: NDArray, n: int, box: NDArray) -> None:
     for k in range(3):
-        swept[which[n], 0, k], swept[which[n], 1, k] = panel[(OWN + k) * WIDTH + n], panel[(OWN + 3 + k) * WIDTH + n]
+        panel[(OWN + k) * WIDTH + n], panel[(OWN + 3 + k) * WIDTH + n] = box[0, k], box[1, k]
+
+
+@register_jitable
+def _read_box(box: NDArray, panel: NDArray, n: int) -> None:
+    for k in range(3):
+        box[0, k], box[1, k] = panel[(OWN + k) * WIDTH + n], panel[(OWN + 3 + k) * WIDTH + n]
+
+
+@register_jitable
+def _widen_parts(
+    swept: NDArray, panel: NDArray, which: NDArray, lanes: int, astray: float, part: int, after: int
+) -> None:
+    """Make the box of each vehicle hold its place, and all `astray`, m, to its sides.
+
+    Where part `after` begins, its box does too, and is the one in the panel from then on.
+    """
+    _widen(panel, whole(lanes), astray)
+    if after != part:
+        for n in range(lanes):
+            _read_box(swept[which[n], part], panel, n)
+            _write_box(panel, n, swept[which[n], after])
+        _widen(panel, whole(lanes), astray)
+
+
+@register_jitable
+def _take_out(swept: NDArray, panel: NDArray, which: NDArray, n: int, lanes: int, part: int) -> int:
+    """Write the box of the vehicle at place n, and put the last one there; return how many are left."""
+    _read_box(swept[which[n], part], panel, n)
     move(panel, n, lanes - 1)
     which[n] = which[lanes - 1]
     return lanes - 1
 
 
 @register_jitable
-def _take_out_landed(swept: NDArray, panel: NDArray, which: NDArray, lanes: int) -> int:
+def _take_out_landed(swept: NDArray, panel: NDArray, which: NDArray, lanes: int, part: int) -> int:
     """Take out the vehicles on the floor; return how many are left."""
     n = 0
     while n < lanes:
         if panel[2 * WIDTH + n] <= 0.0:
-            lanes = _take_out(swept, panel, which, n, lanes)
+            lanes = _take_out(swept, panel, which, n, lanes, part)
         else:
             n += 1
     return lanes
@@ -212,14 +254,16 @@ def _fall(
 ) -> None:
     """Let all vehicles fall, motors off, to the floor; widen the boxes swept."""
     stop_motors(panel, lanes)
-    for _ in range(round(_LONGEST / body[STEP])):
+    part = 0
+    for step in range(round(_LONGEST / body[STEP])):
         step_vehicles(panel, lanes, body, as_array, spare)
-        _widen(panel, whole(lanes), 0.0)
-        lanes = _take_out_landed(swept, panel, which, lanes)
+        before, part = part, _part(swept, (step + 1) * body[STEP])
+        _widen_parts(swept, panel, which, lanes, 0.0, before, part)
+        lanes = _take_out_landed(swept, panel, which, lanes, part)
         if lanes == 0:
             return
     while lanes > 0:
-        lanes = _take_out(swept, panel, which, 0, lanes)
+        lanes = _take_out(swept, panel, which, 0, lanes, part)
 
 
 @njit(error_model="numpy")
@@ -239,7 +283,7 @@ def _go_on_alone(
 ) -> None:
     """Let all vehicles fly on with their last setpoints, to the floor; widen the boxes swept."""
     astray = np.array([0.0, wrong[DRIFT], 0.0])  # m and m/s: drift to a side; m/s at which it believes to sink
-    period = body[STEP]
+    period, part = body[STEP], 0
     settled_after = level_after + round(_SETTLED_AFTER / period)
     for after in range(round(_LONGEST / period)):
         if after == level_after:
@@ -247,7 +291,7 @@ def _go_on_alone(
         if settled_after <= after < off_after:
             powered = (off_after - after) * period
             lanes = _coast_where_settled(
-                swept, panel, which, lanes, gains_as_array, as_array, powered, wrong, astray, spare
+                swept, panel, which, lanes, gains_as_array, as_array, after * period, powered, wrong, astray, spare
             )
         if after < off_after:
             step_controls(panel, lanes, gains, body, after >= level_after, period)
@@ -255,13 +299,14 @@ def _go_on_alone(
             stop_motors(panel, lanes)
         step_vehicles(panel, lanes, body, as_array, spare)
         _raise(panel, whole(lanes), *_go_astray(astray, wrong, after < off_after, period))
-        _widen(panel, whole(lanes), astray[0])
+        before, part = part, _part(swept, (after + 1) * period)
+        _widen_parts(swept, panel, which, lanes, astray[0], before, part)
         if after > off_after:
-            lanes = _take_out_landed(swept, panel, which, lanes)
+            lanes = _take_out_landed(swept, panel, which, lanes, part)
         if lanes == 0:
             return
     while lanes > 0:
-        lanes = _take_out(swept, panel, which, 0, lanes)
+        lanes = _take_out(swept, panel, which, 0, lanes, part)
 
 
 @register_jitable
@@ -272,6 +317,7 @@ def _coast_where_settled(
     lanes: int,
     gains: NDArray,
     body: NDArray,
+    begin: float,
     powered: float,
     wrong: NDArray,
     astray: NDArray,
@@ -285,8 +331,8 @@ def _coast_where_settled(
             branch, now = which[n], spare[0]
             read_snapshot(now, panel, n)
             height, climb = panel[(PLACE + 2) * WIDTH + n], panel[(SPEED + 2) * WIDTH + n]
-            lanes = _take_out(swept, panel, which, n, lanes)
-            _coast(swept[branch], now, height, climb, gains, body, powered, wrong, astray.copy())
+            lanes = _take_out(swept, panel, which, n, lanes, _part(swept, begin))
+            _coast(swept, branch, now, height, climb, gains, body, begin, powered, wrong, astray.copy())
         else:
             n += 1
     return lanes
@@ -295,17 +341,20 @@ def _coast_where_settled(
 @njit(allocates=False)
 def _coast(
     swept: NDArray,
+    branch: int,
     now: NDArray,
     height: float,
     climb: float,
     gains: NDArray,
     body: NDArray,
+    begin: float,
     powered: float,
     wrong: NDArray,
     astray: NDArray,
 ) -> None:
     """Follow the place of a vehicle whose attitude stands still, for `powered` s with motors and to the floor.
 
+    That begins at `begin`, s after the setpoint.
     `height` and `climb`, m/s, are those of its setpoint. Semi-implicit midpoint: height control, motor lag and drag as
     in the whole simulation. `now` and `astray` are overwritten.
     """
@@ -331,11 +380,13 @@ def _coast(
             now[k] += _COAST_STEP * 0.5 * (speed + now[3 + k])
         rise, faster = _go_astray(astray, wrong, time < powered, _COAST_STEP)
         height, climb = height + rise, climb + faster
-        for k in range(3):
-            aside = astray[0] if k < 2 else 0.0
-            swept[0, k] = _lower(swept[0, k], now[k] - aside)
-            swept[1, k] = _higher(swept[1, k], now[k] + aside)
+        part = _part(swept, begin + time)
         time += _COAST_STEP
+        for each in range(part, _part(swept, begin + time) + 1):
+            box = swept[branch, each]
+            for k in range(3):
+                aside = astray[0] if k < 2 else 0.0
+                box[0, k], box[1, k] = _lower(box[0, k], now[k] - aside), _higher(box[1, k], now[k] + aside)
         if time > powered and now[2] <= 0.0:
             break
 

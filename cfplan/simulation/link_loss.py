@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import Timeouts, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
-from cfplan.numbers import shown
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import SIDES, inside
 from cfplan.simulation.dynamics.body import pack_body
 from cfplan.simulation.dynamics.branching import SNAPSHOT_SIZE, arrival_steps, hovering_snapshot, setpoint_rows
 from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
@@ -43,8 +42,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
 OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
-WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
-"""(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
+_PARTS = 9  # boxes of a sweep, if there are obstacles
 _WORTH_THREADS = 400  # setpoints, of which each motor lag has a thread
 _Body = TypeVar("_Body")
 _Found = TypeVar("_Found")
@@ -65,10 +63,15 @@ class LinkLoss:
 
     moment: float  # s from the first setpoint
     distance: float  # m, horizontally from the last setpoint to the far corner of the box that the vehicle sweeps
-    beyond: float  # m beyond the walls or the ceiling; negative inside
+    beyond: float  # m beyond a wall or the ceiling, or into an obstacle; negative inside
+    at_obstacle: bool = False  # whether that is an obstacle
 
     def __str__(self) -> str:
-        walls = "inside the walls" if inside(self.beyond) else f"{self.beyond:.1f} m beyond the walls"
+        walls = (
+            "inside the walls"
+            if inside(self.beyond)
+            else f"{self.beyond:.1f} m {'into an obstacle' if self.at_obstacle else 'beyond the walls'}"
+        )
         comes_down = f"the vehicle comes down {self.distance:.1f} m farther on, {walls}"
         return f"lost at the worst moment, {self.moment:.1f} s, {comes_down}"
 
@@ -79,10 +82,11 @@ class LinkLossMoments:
 
     time: NDArray  # (N,) s of each setpoint from the first
     place: NDArray  # (N, 3) m, of each setpoint
-    low: NDArray  # (N, 3) m, the corners of the box that the vehicle sweeps from there to the floor
-    high: NDArray  # (N, 3) m
-    beyond: NDArray  # (N,) m beyond the walls or the ceiling; negative inside
-    wall: NDArray  # (N,) int, the wall that it comes nearest to or goes farthest beyond, as in WALLS
+    boxes: (
+        NDArray  # (N, S, 2, 3) m, low and high corners of what the vehicle sweeps from there to the floor, in S parts
+    )
+    beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
+    face: NDArray  # (N,) int, which of the faces of the space that is, or which it comes nearest to
     distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
     snapshots: NDArray  # (L, N, 31) as in `branching`, at each setpoint, for each motor lag; (L, 0, 31) within stops
 
@@ -90,13 +94,18 @@ class LinkLossMoments:
     def worst(self) -> LinkLoss:
         """Return the setpoint after which the vehicle ends farthest out; what is not a number is farthest."""
         at = int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
-        return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]))
+        at_obstacle = bool(self.face[at] >= SIDES)
+        return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]), at_obstacle)
 
-    def name_of_wall(self, number: int, limits: Limits) -> str:
-        """Return what people call the wall of a setpoint: "the wall x = 2.25 m"."""
-        axis, side = WALLS[self.wall[number]]
-        place = (limits.space.low, limits.space.high)[side][axis]
-        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {shown(place, 'g')} m"
+    @property
+    def low(self) -> NDArray:
+        """Return (N, 3) m, the low corner of all that the vehicle sweeps."""
+        return np.asarray(self.boxes[:, :, 0].min(axis=1))
+
+    @property
+    def high(self) -> NDArray:
+        """Return (N, 3) m, the high corner of all that the vehicle sweeps."""
+        return np.asarray(self.boxes[:, :, 1].max(axis=1))
 
 
 def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLoss:
@@ -201,8 +210,7 @@ def _lose_link(
     `snapshots`, (L, N, 31), are at each setpoint, for each motor lag.
     """
     time, wrong = np.arange(len(state.position)) / rate, _wrong(limits)
-    coarse = None if seen is None else np.stack([seen.low, seen.high], axis=1)
-    boxes = _boxes(state, limits, rate, snapshots, forks, wrong, coarse)
+    boxes = _boxes(state, limits, rate, snapshots, forks, wrong, None if seen is None else seen.boxes)
     found = _judge(time, state.position, boxes, limits, snapshots)
     near = forks & ~(found.beyond < -_NEAR)
     if wrong[LIFT] and near.any():
@@ -220,15 +228,15 @@ def _boxes(
     wrong: NDArray,
     others: NDArray | None,
 ) -> list[NDArray]:
-    """Return for each motor lag the boxes, (N, 2, 3), swept from where `forks` says so; `others` at the others."""
+    """Return for each motor lag the boxes, (N, S, 2, 3), swept from where `forks` says so; `others` at the others."""
     rows = setpoint_rows(state)[forks]
 
     def one(body: tuple[NDArray, NDArray], begins: NDArray) -> NDArray:
-        swept = np.empty((len(rows), 2, 3))
+        swept = np.empty((len(rows), _parts(limits), 2, 3))
         leave_alone(swept, begins[forks], rows, _gains(limits), body[1], *_steps(limits), wrong)
         if others is None and len(rows) == len(forks):
             return swept
-        boxes = np.empty((len(forks), 2, 3)) if others is None else others.copy()
+        boxes = np.empty((len(forks), *swept.shape[1:])) if others is None else others.copy()
         boxes[forks] = swept
         return boxes
 
@@ -244,15 +252,14 @@ def _look_coarsely(
     """
     count = len(state.position)
     rows = np.unique(np.append(np.arange(0, count, every), count - 1))
-    boxes = np.empty((len(rows), 2, 3))
+    boxes = np.empty((len(rows), _parts(limits), 2, 3))
     leave_alone(
         boxes, snapshots[rows], setpoint_rows(state)[rows], _gains(limits), _coarse_bodies(limits),
         *_steps(limits, _COARSE_STEP), _wrong(limits),
     )  # fmt: skip
     before = np.repeat(np.arange(len(rows)), np.diff(rows, append=count))
     after = np.where(np.isin(np.arange(count), rows), before, np.minimum(before + 1, len(rows) - 1))
-    low, high = np.minimum(boxes[before, 0], boxes[after, 0]), np.maximum(boxes[before, 1], boxes[after, 1])
-    box, no_snapshots = np.stack([low, high], axis=1), np.empty((0, count, SNAPSHOT_SIZE))
+    box, no_snapshots = _united([boxes[before], boxes[after]]), np.empty((0, count, SNAPSHOT_SIZE))
     return _judge(np.arange(count) / rate, state.position, [box], limits, no_snapshots)
 
 
@@ -288,7 +295,7 @@ def link_loss_within_stops(
     steps = _steps(limits, _COARSE_STEP if coarsely else _STEP)
 
     def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
-        boxes = np.empty((np.count_nonzero(forks), 2, 3))
+        boxes = np.empty((np.count_nonzero(forks), _parts(limits), 2, 3))
         leave_alone_in_stops(boxes, rows, begin, forks, gains, *body, *steps, arrivals, wrong)
         return boxes
 
@@ -324,16 +331,22 @@ def _wrong(limits: Limits) -> NDArray:
 
 
 def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, snapshots: NDArray) -> LinkLossMoments:
-    """Return the worst of the boxes, (N, 2, 3) m, of each motor lag."""
-    low, high = np.min([box[:, 0] for box in boxes], axis=0), np.max([box[:, 1] for box in boxes], axis=0)
-    space = np.array([limits.space.low, limits.space.high])
-    out = np.stack(
-        [(high[:, axis] - space[1, axis]) if side else (space[0, axis] - low[:, axis]) for axis, side in WALLS], axis=1
-    )
-    away = np.maximum(place - low, high - place)[:, :2]
-    return LinkLossMoments(
-        time, place, low, high, out.max(axis=1), np.argmax(out, axis=1), np.hypot(away[:, 0], away[:, 1]), snapshots
-    )
+    """Return the worst of the boxes, (N, S, 2, 3) m, of each motor lag."""
+    swept = _united(boxes)
+    beyond, face = limits.space.swept(swept)
+    away = np.maximum(place - swept[:, :, 0].min(axis=1), swept[:, :, 1].max(axis=1) - place)[:, :2]
+    return LinkLossMoments(time, place, swept, beyond, face, np.hypot(away[:, 0], away[:, 1]), snapshots)
+
+
+def _united(boxes: list[NDArray]) -> NDArray:
+    """Return the boxes, (N, S, 2, 3), that hold those of each of a list."""
+    low, high = np.min([each[:, :, 0] for each in boxes], axis=0), np.max([each[:, :, 1] for each in boxes], axis=0)
+    return np.stack([low, high], axis=2)
+
+
+def _parts(limits: Limits) -> int:
+    """Return how many boxes a sweep is cut into: for walls one tells as much."""
+    return _PARTS if limits.space.obstacles else 1
 
 
 def _of_each_lag(

@@ -147,7 +147,12 @@ def _use_path(folder: Path) -> None:
 
 
 def _safety(_: Path) -> list[Sound]:
-    return [{"safety.yaml": SAFETY.read_bytes()}]
+    furnished = yaml.safe_load(SAFETY.read_bytes())
+    furnished["space"]["obstacles"] = [
+        {"name": "table", "box": {"low": [0.5, 1.0, 0.0], "high": [1.5, 2.0, 0.8], "yaw_deg": 30}},
+        {"cylinder": {"x": -1.0, "y": 2.0, "radius": 0.1, "height": 2.0}},
+    ]
+    return [{"safety.yaml": SAFETY.read_bytes()}, {"safety.yaml": yaml.safe_dump(furnished).encode()}]
 
 
 def _airframe(_: Path) -> list[Sound]:

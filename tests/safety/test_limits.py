@@ -12,6 +12,7 @@ from cfplan.errors import InputError
 from cfplan.flight.firmware import NEWEST_KNOWN
 from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import DEFAULTS, load_limits
+from cfplan.safety.space import SIDES, Box, Cylinder
 from cfplan.vehicle.airframes import AIRFRAMES
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
@@ -209,3 +210,47 @@ def test_the_place_of_a_wrong_value_is_its_line_and_column(tmp_path):
     with pytest.raises(InputError) as error:
         load_limits(file)
     assert error.value.where == f"{file}:{line}:13"
+
+
+TABLE = {"name": "table", "box": {"low": [0.5, 1.0, 0.0], "high": [1.5, 2.0, 0.8], "yaw_deg": 30}}
+POLE = {"cylinder": {"x": -1, "y": 2, "radius": 0.1, "height": 1.5}}
+
+
+def test_obstacles_are_boxes_that_may_be_turned_and_cylinders_on_the_floor(tmp_path):
+    space = load_limits(changed(tmp_path, {"space.obstacles": [TABLE, POLE], "space.low": [-2.25, -4, -0.1]})).space
+    table, pole = space.obstacles
+    assert table == Box((0.5, 1.0, 0.0), (1.5, 2.0, 0.8), math.radians(30), "table")
+    assert pole == Cylinder(-1.0, 2.0, 0.1, -0.1, 1.4)
+    assert space.faces[SIDES:] == ("the obstacle 'table'", "obstacle 2")
+    assert load_limits(SAFETY).space.obstacles == ()
+
+
+@pytest.mark.parametrize(
+    ("obstacles", "line", "message"),
+    [
+        ([{"box": {"low": [0, 0, 0], "high": [1, 0, 1]}}], "- 0", r"the box from 0 to 0 m in y has no inside"),
+        ([{"box": {"low": [0, 0, 1], "high": [1, 1, 0.5]}}], "- 0.5", r"from 1 to 0\.5 m in z.*its low corner"),
+        ([TABLE | POLE], "- name", r"either a box or a cylinder.*hint: write"),
+        ([{"name": "nothing"}], "- name", r"either a box or a cylinder"),
+        ([{"cylinder": POLE["cylinder"] | {"radius": 0}}], "radius", r"radius should be greater than 0"),
+        ([{"cylinder": POLE["cylinder"] | {"height": -1}}], "height", r"height should be greater than 0"),
+        ([{"cylinder": POLE["cylinder"] | {"x": math.nan}}], "x:", r"finite number"),
+        ([{"cylinder": POLE["cylinder"] | {"hight": 1}}], "hight", r"did you mean 'height'\?"),
+        ([POLE, TABLE | {"box": {"low": [500, 0, 0], "high": [900, 9, 9]}}], "- 500", r"less than or equal to 32"),
+        ([POLE, {"cylinder": {"x": 3, "y": 0, "radius": 0.5, "height": 1}}], "- cylinder", r"obstacle 2 is not in the"),
+        ([{"cylinder": {"x": 0, "y": 0, "radius": 9, "height": 1}}], "- cylinder", r"leave no place to take off to"),
+        ([copy.deepcopy(POLE) for _ in range(1001)], "- cylinder", r"at most 1000"),
+    ],
+)
+def test_an_obstacle_that_cannot_be_is_refused_with_its_place(tmp_path, obstacles, line, message):
+    file = changed(tmp_path, {"space.obstacles": obstacles})
+    with pytest.raises(InputError, match=message) as error:
+        load_limits(file)
+    number = int(error.value.where.split(":")[-2])
+    assert line in file.read_text().splitlines()[number - 1]
+
+
+def test_an_obstacle_partly_in_the_room_counts_and_so_does_one_that_hangs(tmp_path):
+    wardrobe = {"box": {"low": [2.2, -1, 0], "high": [3, 1, 2]}}
+    lamp = {"name": "lamp", "cylinder": POLE["cylinder"]}
+    assert len(load_limits(changed(tmp_path, {"space.obstacles": [wardrobe, lamp]})).space.obstacles) == 2

@@ -215,7 +215,7 @@ def test_it_climbs_on_with_the_vertical_speed_of_its_last_setpoint(unwatched, sp
 
 def test_it_says_which_wall(limits):
     found = link_loss_at_every_setpoint(straight(1.0, 2.0), limits)
-    assert found.name_of_wall(0, limits) == f"the wall x = {limits.space.low[0]:g} m"  # it begins 2 m to the left
+    assert limits.space.faces[found.face[0]] == f"the wall x = {limits.space.low[0]:g} m"  # it begins 2 m to the left
     assert found.worst.beyond == found.beyond.max()
     assert found.worst.moment == found.time[np.argmax(found.beyond)]
 
@@ -231,7 +231,7 @@ def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_
         near = all_of_them.beyond > -within
         assert within == 0.0 or near.any()
         np.testing.assert_array_equal(found.beyond[near], all_of_them.beyond[near])
-        np.testing.assert_array_equal(found.wall[near], all_of_them.wall[near])
+        np.testing.assert_array_equal(found.face[near], all_of_them.face[near])
         assert np.all(found.beyond >= all_of_them.beyond)
         assert np.all(found.beyond <= all_of_them.beyond + 2.5 * ALLOWANCE)
         np.testing.assert_array_equal(found.snapshots, all_of_them.snapshots)

@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import Timeouts
-from cfplan.numbers import shown
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import SIDES
 from cfplan.vehicle.airframe import GRAVITY
 
-WALLS = ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1))
-"""(axis, low or high side) of the walls and the ceiling; on the floor is where it ends."""
 _LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; moments that are looked at
+_PARTS = tuple(slice(begin, begin + 9) for begin in range(0, _MOMENTS - 1, 8))
+"""Moments of each part of a fall, which has its own box if there are obstacles; the last is the next part's first."""
 _G = np.array([0.0, 0.0, GRAVITY])
 
 
@@ -30,21 +30,15 @@ _G = np.array([0.0, 0.0, GRAVITY])
 class Falls:
     """Where the vehicle falls from each of N states, motors off."""
 
-    beyond: NDArray  # (N,) m beyond the walls or the ceiling; negative inside
-    wall: NDArray  # (N,) int, the wall that it comes nearest to or goes farthest beyond, as in WALLS
-    reach: NDArray  # (N,) m, towards that wall, from where it is
+    beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
+    face: NDArray  # (N,) int, which of the faces of the space that is, or which it comes nearest to
+    reach: NDArray  # (N,) m, towards that wall, from where it is; aside if it is an obstacle
     distance: NDArray  # (N,) m, horizontally, to the far corner of the box that it sweeps
 
     @property
     def worst(self) -> int:
         """Return the number of the state that ends farthest out; what is not a number is farthest."""
         return int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
-
-    def name_of_wall(self, number: int, limits: Limits) -> str:
-        """Return what people call the wall of a state: "the wall x = 2.25 m"."""
-        axis, side = WALLS[self.wall[number]]
-        place = (limits.space.low, limits.space.high)[side][axis]
-        return f"the {'ceiling' if axis == 2 else 'wall'} {'xyz'[axis]} = {shown(place, 'g')} m"
 
 
 def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
@@ -54,7 +48,8 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
     """
     position, velocity, acceleration = (states[:, order, :3] for order in range(3))
     time, floor = np.linspace(0.0, _LONGEST, _MOMENTS), limits.space.low[2]
-    low, high = np.full((len(states), 3), np.inf), np.full((len(states), 3), -np.inf)
+    boxes = np.empty((len(states), len(_PARTS) if limits.space.obstacles else 1, 2, 3))
+    boxes[:, :, 0], boxes[:, :, 1] = np.inf, -np.inf
     for lag in (0.0, max(*limits.link_loss.motor_lags, limits.airframe.motor_time_constant)):
         pushed = lag * (time - lag * -np.expm1(-time / lag)) if lag else np.zeros_like(time)
         place = (
@@ -66,15 +61,21 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
         in_air = np.concatenate([np.ones((len(states), 1), bool), place[:, :-1, 2] > floor], axis=1)[..., None]
         aside, up = _astray(limits, time)
         spread = np.stack([aside + deviation, aside + deviation, up + deviation + 0.0 * time], axis=1)
-        low = np.minimum(low, np.where(in_air, place - spread, np.inf).min(axis=1))
-        high = np.maximum(high, np.where(in_air, place + spread, -np.inf).max(axis=1))
-    space = (np.array(limits.space.low), np.array(limits.space.high))
-    out = np.stack([high[:, a] - space[1][a] if side else space[0][a] - low[:, a] for a, side in WALLS], axis=1)
-    wall = np.argmax(out, axis=1)
-    number, (axis, side) = np.arange(len(states)), np.array(WALLS)[wall].T
-    reach = np.where(side[:, None], high - position, position - low)[number, axis]
+        low, high = np.where(in_air, place - spread, np.inf), np.where(in_air, place + spread, -np.inf)
+        for part, some in enumerate(_PARTS if limits.space.obstacles else (slice(None),)):
+            boxes[:, part, 0] = np.minimum(boxes[:, part, 0], low[:, some].min(axis=1))
+            boxes[:, part, 1] = np.maximum(boxes[:, part, 1], high[:, some].max(axis=1))
+    for part in range(1, boxes.shape[1]):  # where it lies on the floor already
+        boxes[:, part] = np.where(
+            boxes[:, part] == (np.array([np.inf, -np.inf])[:, None]), boxes[:, part - 1], boxes[:, part]
+        )
+    beyond, face = limits.space.swept(boxes)
+    low, high = boxes[:, :, 0].min(axis=1), boxes[:, :, 1].max(axis=1)
     away = np.maximum(position - low, high - position)[:, :2]
-    return Falls(out.max(axis=1), wall, reach, np.hypot(away[:, 0], away[:, 1]))
+    distance = np.hypot(away[:, 0], away[:, 1])
+    to_walls = np.concatenate([position - low, high - position], axis=1)
+    reach = np.where(face < SIDES, to_walls[np.arange(len(face)), np.minimum(face, SIDES - 1)], distance)
+    return Falls(beyond, face, reach, distance)
 
 
 def _astray(limits: Limits, time: NDArray) -> tuple[NDArray, float]:

@@ -7,14 +7,25 @@ between them are those of the certificate of trajectories.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.on_board.pieces import Pieces, body_rates, derivatives_of, goals_at
-from cfplan.safety.certificate import LEAST_POINTS, TIME_STEP, WALLS, Certificate, Margin, share_of
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import shifted
+from cfplan.safety.certificate import (
+    LEAST_POINTS,
+    TIME_STEP,
+    WALLS,
+    Certificate,
+    Margin,
+    half_of,
+    obstacle_margin,
+    share_of,
+)
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space
@@ -67,13 +78,30 @@ def certify_pieces(pieces: Pieces, airframe: Airframe, limits: PlanLimits, space
     """
     check_joints(pieces)
     check_arithmetic(pieces)
-    return certify_samples(sample_pieces(pieces), airframe, limits, space)
+    samples = sample_pieces(pieces)
+    certificate = certify_samples(samples, airframe, limits)
+    if space is None:
+        return certificate
+    low, high = np.array(space.low)[:, None], np.array(space.high)[:, None]
+    position = samples.derivatives[:, 0, :3].T
+    walls = Quantity(WALLS, "m", "", "", AT_LEAST, 0, 3)
+    rows = np.minimum(position - low, high - position)
+    margins = [*certificate.margins, _margin(samples, rows, walls, space.margin, half_of(space))]
+    if space.obstacles:
+        margins.append(obstacle_margin(_path_of(pieces), space, np.asarray))
+    return replace(certificate, margins=tuple(margins))
 
 
-def certify_samples(
-    samples: Samples, airframe: Airframe, limits: PlanLimits, space: Space | None = None
-) -> Certificate:
-    """Return the certificate of samples; what is not a number fails."""
+def _path_of(pieces: Pieces) -> Path:
+    """Return the way of the pieces, by time."""
+    durations = pieces.durations.astype(float)
+    table = pieces.coefficients[:, :3].astype(float).swapaxes(1, 2)
+    table[-1:] = shifted(table[-1:], durations[-1:])  # of a path, the last piece is expanded about its end
+    return Path(np.append(pieces.begins, pieces.duration), table)
+
+
+def certify_samples(samples: Samples, airframe: Airframe, limits: PlanLimits) -> Certificate:
+    """Return the certificate of samples, without walls and obstacles; what is not a number fails."""
     measured = measures_along(samples, airframe)
     margins = []
     for quantity in QUANTITIES:
@@ -81,12 +109,6 @@ def certify_samples(
         if limit != math.inf:
             rows = measured[quantity.which]
             margins.append(_margin(samples, rows, quantity, limit, quantity.unused(airframe)))
-    if space is not None:
-        low, high = np.array(space.low)[:, None], np.array(space.high)[:, None]
-        position = samples.derivatives[:, 0, :3].T
-        walls = Quantity(WALLS, "m", "", "", AT_LEAST, 0, 3)
-        rows = np.minimum(position - low, high - position)
-        margins.append(_margin(samples, rows, walls, space.margin, float((high - low).min()) / 2))
     return Certificate(tuple(margins), float(samples.time[-1]), len(samples.time))
 
 

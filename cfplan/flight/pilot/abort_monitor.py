@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
+import numpy as np
+
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
@@ -144,10 +146,8 @@ class AbortMonitor:
             yield AbortReason.FALLEN.abort(Rung.CUT, metres=below)
 
     def _beyond_fence(self, position: Triple) -> float:
-        """Return how far, m, a position is beyond the space less its margin; the floor does not count."""
-        space, (x, y, z) = self._limits.space, position
-        above_middle = max(z, (space.low[2] + space.high[2]) / 2)
-        return float(space.beyond((x, y, above_middle)).max())
+        """Return how far, m, a position is beyond a wall or into an obstacle less the margin; no floor counts."""
+        return float(self._limits.space.nearest(np.array([position]), floor=False)[0][0])
 
     def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
         """Return the abort if its reason has lasted; a single noisy value is no reason."""

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
@@ -37,6 +38,7 @@ from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple, VehicleStatus
+from cfplan.safety.space import Space
 from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
@@ -253,10 +255,10 @@ class FlightLoop:
             velocity = 0.0, 0.0, 0.0
             if estimate is not None and self.health.estimate is FRESH:
                 position, velocity, yaw = estimate.position, estimate.velocity, yaw_of(estimate.quaternion)
-        inside, (x, y, z) = space.margin, position
-        x = min(max(x + _BRAKES_IN * velocity[0], space.low[0] + inside), space.high[0] - inside)
-        y = min(max(y + _BRAKES_IN * velocity[1], space.low[1] + inside), space.high[1] - inside)
-        place, rate = (x, y, min(z, space.high[2] - inside)), self.mission.rate
+        (x, y, z), rate = position, self.mission.rate
+        place = _between_walls((x + _BRAKES_IN * velocity[0], y + _BRAKES_IN * velocity[1], z), space)
+        if space.obstacles and not space.holds(place):  # rather where it is than in an obstacle ahead
+            place = _between_walls((x, y, z), space)
         motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
         self.begin(Stream(encode_motion(motion, motion.acceleration, gains_under(self.limits), space=space), rate))
         self._left_alone = self.health.uplink is not FRESH
@@ -553,3 +555,10 @@ class FlightLoop:
 def committed(time: float, splice: int, checksum: int, payloads: NDArray) -> PlanCommitted:
     """Return the telemetry of setpoints (K, 29) that are committed from number `splice` on, in a proposal or before."""
     return PlanCommitted(time, splice, checksum, payloads.tobytes())
+
+
+def _between_walls(place: Triple, space: Space) -> Triple:
+    """Return the place nearest to one, m, that keeps the margin from walls and ceiling."""
+    low, high = np.add(space.low, space.margin).tolist(), np.subtract(space.high, space.margin).tolist()
+    x, y, z = place
+    return min(max(x, low[0]), high[0]), min(max(y, low[1]), high[1]), min(z, high[2])

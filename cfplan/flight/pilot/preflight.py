@@ -19,16 +19,17 @@ from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, ParameterRule, Traffic
 from cfplan.flight.radio.supervisor_bits import FAULTS, FLYING
 from cfplan.flight.setpoints.commitment import QUANTUM
-from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.packets import positions_of
 from cfplan.flight.telemetry import Estimate, Triple, VehicleStatus
 from cfplan.numbers import coordinates, shown
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import SIDES, inside
 from cfplan.vehicle.rotations import tilt_of, yaw_of
 
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
+_WAY_STEP = 0.01  # m, between the places that are looked at on the way to the start
 LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors lean by less
 
 
@@ -252,20 +253,40 @@ def check_variance(snapshot: PreflightSnapshot) -> Check:
 def check_start_place(snapshot: PreflightSnapshot) -> Check:
     """The column above the vehicle, up to the take-off height, must be inside the space."""
     space, (x, y, _) = snapshot.mission.limits.space, snapshot.poses[-1].position
-    beyond = space.beyond((x, y, snapshot.mission.take_off_height))
-    worst = float(np.max(beyond))
+    above = np.array([(x, y, snapshot.mission.take_off_height)])
+    (top,), _ = space.nearest(above)
+    (column,), (face,) = space.above_floor(above)
+    worst = max(float(top), float(column))
+    beside = f", beside {space.faces[face]}" if column >= top and face >= SIDES else ""
     return Check(
-        "place of take-off", f"{coordinates((x, y), '.2f')} m, {shown(-worst, '.2f')} m inside",
+        "place of take-off", f"{coordinates((x, y), '.2f')} m, {shown(-worst, '.2f')} m inside{beside}",
         "inside the space less its margin", bool(inside(worst)), "move the vehicle towards the middle of the room",
+    )  # fmt: skip
+
+
+def check_way_to_start(snapshot: PreflightSnapshot) -> Check:
+    """Between the vehicle's take-off and the start no obstacle stands, nor beneath, where link loss would end."""
+    mission, limits = snapshot.mission, snapshot.mission.limits
+    space, (x, y, _), (start, _) = limits.space, snapshot.poses[-1].position, mission.start
+    name, threshold = "way to the start", "clear of obstacles by the margin, and so what is beneath"
+    if not space.obstacles:  # between walls a way is inside if both its ends are
+        return Check(name, "no obstacles", threshold, True)
+    begin, end = np.array([x, y, mission.take_off_height]), np.array(start)
+    way = np.linspace(begin, end, int(np.linalg.norm(end - begin) / _WAY_STEP) + 2)
+    beyond, face = space.nearest(way) if limits.link_loss.only_warn else space.above_floor(way)
+    at = int(np.argmax(beyond))
+    return Check(
+        name,
+        f"{shown(-float(beyond[at]), '.2f')} m inside at {coordinates(way[at], '.2f')} m, by {space.faces[face[at]]}",
+        threshold, bool(inside(beyond[at], QUANTUM)), "place the vehicle where nothing stands between it and the start",
     )  # fmt: skip
 
 
 def check_plan_inside(snapshot: PreflightSnapshot) -> Check:
     """Each setpoint and each stop; all of them on the path or within rounding of it."""
     space = snapshot.mission.limits.space
-    planned = decode(snapshot.mission.payloads).position
-    stops = decode(snapshot.mission.stops.reshape(-1, snapshot.mission.stops.shape[-1])).position
-    worst = max(float(np.max(space.beyond(planned))), float(np.max(space.beyond(stops))))
+    planned, stops = (positions_of(each).reshape(-1, 3) for each in (snapshot.mission.payloads, snapshot.mission.stops))
+    worst = max(space.farthest(planned), space.farthest(stops))
     return Check(
         "plan and stops in the space", f"{shown(-worst, '.3f')} m inside", "inside the space less its margin",
         bool(inside(worst, QUANTUM)), "plan again with this safety.yaml",
@@ -301,6 +322,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_tilt,
     check_variance,
     check_start_place,
+    check_way_to_start,
     check_plan_inside,
     check_waking,
 )
@@ -332,11 +354,10 @@ def check_fall(snapshot: PreflightSnapshot) -> Check:
     ways.append(_hover_to_hover((x, y, height), mission.on_board.begin[:3], limits.ground.go_to_speed))
     falls = falls_from(np.concatenate(ways), limits, mission.on_board.deviation)
     beyond = float(falls.beyond[falls.worst])
-    where = falls.name_of_wall(falls.worst, limits)
-    side = "from" if inside(beyond) else "beyond"
-    found = f"trajectory {mission.on_board.falls}; before it {abs(beyond):.2f} m {side} "
+    where = limits.space.describe(beyond, int(falls.face[falls.worst]))
+    found = f"trajectory {mission.on_board.falls}; before it {where}"
     return Check(
-        "fall after link loss", found + where, "inside the walls", bool(inside(beyond)) or limits.link_loss.only_warn,
+        "fall after link loss", found, "inside the walls", bool(inside(beyond)) or limits.link_loss.only_warn,
         "move the vehicle towards the middle of the room, or lower `ground.go_to_speed`",
     )  # fmt: skip
 

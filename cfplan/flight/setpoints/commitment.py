@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, LEAD, RATE, controller_attitude
 from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, excess_of, motion_extremes
-from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode
+from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, positions_of
 from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
@@ -314,8 +314,9 @@ def _first_wrong(
     """Return the first fault in the rows before `end` of runs, (R, L, 29): its kind, its text, its run and its row."""
 
     def wrong(first: int, count: int, rows: int) -> tuple[Fault, str] | None:
-        worst = motion_extremes(runs[first : first + count], before[first:], limits.airframe, end=rows)
-        return _wrong(worst, limits, in_stop=in_stop)
+        some = runs[first : first + count]
+        worst = motion_extremes(some, before[first:], limits.airframe, end=rows)
+        return _wrong(worst, some[:, :rows], limits, in_stop=in_stop)
 
     if not wrong(0, len(runs), end):
         return None
@@ -325,13 +326,15 @@ def _first_wrong(
     return None if found is None else (*found, run, row)
 
 
-def _wrong(worst: MotionExtremes, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
-    """Return kind and text of the fault in a motion, by its worst values; None if there is no fault."""
+def _wrong(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
+    """Return kind and text of the fault in runs of setpoints, by their worst values; None if there is no fault."""
     # Stops lie on the chords between setpoints, where each position is off by acceleration times period² / 8 at most.
     chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0
     if not worst.jump <= _JUMP + chords:
         return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
-    beyond = float(limits.space.beyond(worst.corners).max())
+    # Between walls the outermost corners tell all; obstacles stand between them.
+    places = positions_of(runs).reshape(-1, 3) if limits.space.obstacles else worst.corners
+    beyond = limits.space.farthest(places)
     if not inside(beyond, QUANTUM):
         return Fault.SPACE, f"is {beyond:.3f} m too far out"
     exceeds = excess_of(worst, limits, in_stop=in_stop)

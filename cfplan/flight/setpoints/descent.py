@@ -19,7 +19,7 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints, decode, encode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import Space
+from cfplan.safety.space import SIDES, Space, inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of
 
@@ -102,12 +102,15 @@ def descent(
 
 
 def off_walls(position: Triple, space: Space) -> tuple[float, float]:
-    """Return the way, x and y in m, that leads a vehicle at a position, m, off the walls nearby."""
+    """Return the way, x and y in m, that leads a vehicle at a position, m, off the walls nearby; not at an obstacle."""
     x, y = (
         min(max(_clear(place, low, high) - place, -_ASIDE_MAX), _ASIDE_MAX)
         for place, low, high in zip(position[:2], space.low[:2], space.high[:2], strict=True)
     )
-    return x, y
+    height = max(position[2] - space.low[2], 0.0)
+    half = np.array([abs(x), abs(y), height]) / 2  # of the box that holds the way as it sinks
+    middle = (position[0] + x / 2, position[1] + y / 2, space.low[2] + height / 2)
+    return (x, y) if inside(space.beyond(middle, half)[SIDES:]).all() else (0.0, 0.0)
 
 
 def _clear(place: float, low: float, high: float) -> float:

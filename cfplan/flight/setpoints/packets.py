@@ -101,6 +101,12 @@ def decompress_quaternion(compressed: ArrayLike) -> NDArray:
     return _decompressed(np.array(compressed, dtype=np.int64))
 
 
+def positions_of(payloads: NDArray) -> NDArray:
+    """Return the positions, (..., 3) m, of payloads, (..., 29) uint8, in less time than decode()."""
+    begin = FIELD_PLACES[0]
+    return np.ascontiguousarray(payloads[..., begin : begin + 6]).view("<i2") * 1e-3
+
+
 @njit(error_model="numpy")
 def _packed(out: NDArray, values: tuple[NDArray, ...], compressed: NDArray) -> tuple[int, int]:
     """Write the payloads, (N, 29), from the fields of _IN_MILLI, (N, 3) each, and the compressed quaternions, (N,).

@@ -13,8 +13,8 @@ This matters once setpoints stop: the firmware then wants a level attitude, yet 
 settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
 which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally,
 as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from that wall,
-the more the nearer, so that an attitude that the vehicle has wrong does not carry it there. How much depends on how
-long level-out lasts until the motors stop (LevelOut).
+the more the nearer, so that an attitude that the vehicle has wrong does not carry it there; from an obstacle likewise.
+How much depends on how long level-out lasts until the motors stop (LevelOut).
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
 and z(q') may not lean beyond LEAN_MAX, where little of the thrust carries the vehicle and the controller's heading is
@@ -134,6 +134,7 @@ def trade_rates(
         np.array(motion.quaternion, dtype=float, order="C"),
         np.array(motion.body_rate, dtype=float, order="C"),
         _walls(space),
+        _off_obstacles(motion, space, gains.level_out),
         gains.full_rate,
         gains.level_out.pack(),
     )
@@ -157,6 +158,7 @@ def harmless_rates(
         np.array(motion.quaternion, dtype=float, order="C"),
         np.array(motion.body_rate, dtype=float, order="C"),
         _walls(space),
+        _off_obstacles(motion, space, gains.level_out),
         gains.full_rate,
         gains.level_out.pack(),
     )
@@ -224,10 +226,56 @@ def _walls(space: Space | None) -> NDArray:
     return np.array([space.low[:2], space.high[:2]]) if space else np.array([[-np.inf] * 2, [np.inf] * 2])
 
 
+def _off_obstacles(motion: FullStateSetpoints, space: Space | None, goal: LevelOut) -> NDArray:
+    """Return the accelerations, (N, 2) m/s², away from obstacles, as far as those of a wall so near would be."""
+    if space is None or not space.obstacles:
+        return np.zeros((len(motion.position), 2))
+    soon = np.array(motion.position, dtype=float)
+    soon[:, :2] += WALL_LEAD * motion.velocity[:, :2]
+    prisms = np.array([each.prism for each in space.obstacles])
+    return _pushed_off(soon, prisms, goal.pack())
+
+
+@njit(error_model="numpy")
+def _pushed_off(place: NDArray, prisms: NDArray, level_out: NDArray) -> NDArray:
+    """Return what _off_obstacles() does. What is above a vehicle counts as so much farther, what is beneath as beside.
+
+    It comes down there. Accelerations of several obstacles add up, at most to that of one.
+    """
+    out = np.zeros((len(place), 2))
+    reach, stiffness, pull_max = level_out[2], level_out[3], level_out[4]
+    for k in range(len(prisms)):
+        cos, sin = math.cos(prisms[k, 7]), math.sin(prisms[k, 7])
+        foot = prisms[k, 2] - prisms[k, 5]
+        for n in range(len(place)):
+            x, y = place[n, 0] - prisms[k, 0], place[n, 1] - prisms[k, 1]
+            u, v = cos * x + sin * y, cos * y - sin * x
+            over_u, over_v = abs(u) - prisms[k, 3], abs(v) - prisms[k, 4]
+            aside_u, aside_v = max(over_u, 0.0), max(over_v, 0.0)
+            size = math.sqrt(aside_u * aside_u + aside_v * aside_v)
+            if size > 0.0:
+                flat, aside_u, aside_v = size, aside_u / size, aside_v / size
+            else:
+                flat, aside_u = max(over_u, over_v), 1.0 if over_u >= over_v else 0.0
+                aside_v = 1.0 - aside_u
+            flat -= prisms[k, 6]
+            above = max(foot - place[n, 2], 0.0)
+            away = math.sqrt(flat * flat + above * above) if above > 0.0 else flat
+            pull = min(stiffness * max(reach - away, 0.0), pull_max)
+            aside_u, aside_v = math.copysign(aside_u, u) * pull, math.copysign(aside_v, v) * pull
+            out[n, 0] += cos * aside_u - sin * aside_v
+            out[n, 1] += sin * aside_u + cos * aside_v
+    for n in range(len(place)):
+        size = math.sqrt(out[n, 0] * out[n, 0] + out[n, 1] * out[n, 1])
+        if size > pull_max:
+            out[n, 0], out[n, 1] = out[n, 0] * pull_max / size, out[n, 1] * pull_max / size
+    return out
+
+
 # Rows of the panels of _traded: what comes in, what is in between, and what goes out.
 _PLACE, _SPEED, _FORCE, _AHEAD, _ATTITUDE, _TURNING = 0, 2, 4, 7, 9, 13
 _BACK, _TRADED, _SIZE, _MOST = 15, 19, 21, 22
-_RATE, _TURNED, _PUSH, _ROWS = 23, 25, 29, 32
+_RATE, _TURNED, _PUSH, _OFF, _ROWS = 23, 25, 29, 32, 34
 
 
 @njit(error_model="numpy")
@@ -239,6 +287,7 @@ def _traded(
     quaternion: NDArray,
     body_rate: NDArray,
     walls: NDArray,
+    off_obstacles: NDArray,
     full_rate: float,
     level_out: NDArray,
 ) -> tuple[NDArray, NDArray, NDArray]:
@@ -255,6 +304,7 @@ def _traded(
         take_in(panel, _AHEAD, acceleration_ahead[:, :2], begin, lanes)
         take_in(panel, _ATTITUDE, quaternion, begin, lanes)
         take_in(panel, _TURNING, body_rate[:, :2], begin, lanes)
+        take_in(panel, _OFF, off_obstacles, begin, lanes)
         _find_trades(panel, lanes, sides, goal, full_rate)
         for n in range(lanes):
             if math.isnan(panel[_MOST * WIDTH + n]):
@@ -287,7 +337,8 @@ def _find_trade(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: f
     """
     attitude, (wx, wy) = quaternion_in(panel, _ATTITUDE, n), pair_in(panel, _TURNING, n)
     place, speed, coming = pair_in(panel, _PLACE, n), pair_in(panel, _SPEED, n), pair_in(panel, _AHEAD, n)
-    good_x, good_y = _good_rate(place, speed, coming, attitude, sides, full_rate, goal)
+    off = pair_in(panel, _OFF, n)
+    good_x, good_y = _good_rate(place, speed, coming, attitude, sides, off, full_rate, goal)
     half = -0.5 * ATTITUDE_AGE * math.sqrt(wx * wx + wy * wy)
     back = _turn(sine(half), cosine(half), wx, wy)
     dx, dy = wx - good_x, wy - good_y
@@ -374,10 +425,14 @@ def _good_rate(
     ahead: tuple[float, float],
     quaternion: tuple[float, float, float, float],
     sides: _Sides,
+    off: tuple[float, float],
     full_rate: float,
     goal: _Goal,
 ) -> tuple[float, float]:
-    """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls."""
+    """Return the roll and pitch rates, rad/s, at which level-out brakes the speed left and leans away from walls.
+
+    `off`, m/s², is the acceleration away from obstacles.
+    """
     braking, rate_max = goal[0], goal[1]
     x, y = heading_of(quaternion)
     size = math.sqrt(x * x + y * y)
@@ -386,8 +441,8 @@ def _good_rate(
     cos, sin = cos if size > 0.0 else 1.0, sin if size > 0.0 else 0.0
     pull_x = -braking * (SPEED_LEFT * velocity[0] + SPEED_GAINED * ahead[0])
     pull_y = -braking * (SPEED_LEFT * velocity[1] + SPEED_GAINED * ahead[1])
-    pull_x += _pull_off(place[0] + WALL_LEAD * velocity[0], sides[0], goal)
-    pull_y += _pull_off(place[1] + WALL_LEAD * velocity[1], sides[1], goal)
+    pull_x += _pull_off(place[0] + WALL_LEAD * velocity[0], sides[0], goal) + off[0]
+    pull_y += _pull_off(place[1] + WALL_LEAD * velocity[1], sides[1], goal) + off[1]
     forward, left = cos * pull_x + sin * pull_y, cos * pull_y - sin * pull_x
     pull = math.sqrt(forward * forward + left * left)
     scale = full_rate / math.sqrt(GRAVITY * GRAVITY + pull * pull)  # sin(atan(pull / g)) / pull
@@ -405,7 +460,7 @@ def _pull_off(place: float, sides: tuple[float, float], goal: _Goal) -> float:
 
 
 # Rows of the panels of _harmless: what comes in, what is in between, and what goes out.
-_EXCESS, _LENGTH, _LEANING, _ALLOWED, _HARMLESS, _HARMLESS_ROWS = 15, 17, 18, 20, 21, 23
+_EXCESS, _LENGTH, _LEANING, _ALLOWED, _HARMLESS, _OFF_TOO, _HARMLESS_ROWS = 15, 17, 18, 20, 21, 23, 25
 
 
 @njit(error_model="numpy")
@@ -416,6 +471,7 @@ def _harmless(
     quaternion: NDArray,
     body_rate: NDArray,
     walls: NDArray,
+    off_obstacles: NDArray,
     full_rate: float,
     level_out: NDArray,
 ) -> NDArray:
@@ -430,6 +486,7 @@ def _harmless(
         take_in(panel, _AHEAD, acceleration_ahead[:, :2], begin, lanes)
         take_in(panel, _ATTITUDE, quaternion, begin, lanes)
         take_in(panel, _TURNING, body_rate[:, :2], begin, lanes)
+        take_in(panel, _OFF_TOO, off_obstacles, begin, lanes)
         _find_excesses(panel, lanes, sides, goal, full_rate)
         for n in range(lanes):
             if math.isnan(panel[_ALLOWED * WIDTH + n]):
@@ -472,8 +529,9 @@ def _find_excess(panel: NDArray, n: int, sides: _Sides, goal: _Goal, full_rate: 
     quaternion, (wx, wy) = quaternion_in(panel, _ATTITUDE, n), pair_in(panel, _TURNING, n)
     pushed_x = _push(place[0], speed[0], sides[0], reach, stiffness, pull_max)
     pushed_y = _push(place[1], speed[1], sides[1], reach, stiffness, pull_max)
-    wanted_x = pushed_x - braking * (SPEED_LEFT * speed[0] + SPEED_GAINED * coming[0])
-    wanted_y = pushed_y - braking * (SPEED_LEFT * speed[1] + SPEED_GAINED * coming[1])
+    off_x, off_y = pair_in(panel, _OFF_TOO, n)
+    wanted_x = pushed_x + off_x - braking * (SPEED_LEFT * speed[0] + SPEED_GAINED * coming[0])
+    wanted_y = pushed_y + off_y - braking * (SPEED_LEFT * speed[1] + SPEED_GAINED * coming[1])
     x, y = heading_of(quaternion)
     size = max(math.sqrt(x * x + y * y), 1e-12)
     cos, sin = x / size, y / size

@@ -84,6 +84,7 @@ def head(flight: ReportedFlight) -> list[tuple[str, str]]:
     header = flight.record.header
     low, high = header.fence
     sides = " × ".join(f"{b - a:g}" for a, b in zip(low, high, strict=True))
+    obstacles = ", ".join(each.name or f"number {number}" for number, each in enumerate(header.obstacles, start=1))
     return [
         ("begun", begun(flight.record)),
         ("path", header.name),
@@ -91,6 +92,7 @@ def head(flight: ReportedFlight) -> list[tuple[str, str]]:
         ("reached by", header.uri),
         ("planned by", header.planner or UNKNOWN),
         ("room", f"{sides} m"),
+        *([("obstacles", obstacles)] if obstacles else []),
         ("cfplan", header.version),
     ]
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,7 +29,9 @@ from cfplan.recording.rerun.plan_view import log_plan
 from cfplan.recording.rerun.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
 from cfplan.recording.rerun.viewer import open_viewer, save
 from cfplan.recording.summary import dropouts, pose_gaps, reference_span, summary_text
+from cfplan.safety.space import Box, Cylinder
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import about_z
 
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
 LARGEST_FLOOR = 100.0  # m, from the origin, that is drawn
@@ -38,6 +41,7 @@ TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006
 HOVER_ARROW = 0.35  # m, of the thrust in hover
 THRUST_COLOUR: Colour = (240, 228, 66)
 FENCE_COLOUR: Colour = (170, 90, 90)
+OBSTACLE_COLOUR: Colour = (120, 104, 84)
 FLOOR_COLOUR: Colour = (62, 66, 74)
 PATH_COLOUR: Colour = (130, 130, 140)
 COMMITTED_COLOUR: Colour = (120, 170, 255)
@@ -107,9 +111,31 @@ def log_room(stream: rr.RecordingStream, header: RecordHeader) -> None:
     stream.log(layout.FENCE, box, static=True)
     floor = rr.LineStrips3D(floor_lines(low, high), colors=[FLOOR_COLOUR], radii=rr.Radius.ui_points(0.5))
     stream.log(layout.FLOOR, floor, static=True)
+    _log_obstacles(stream, header)
     if len(header.path):
         path = rr.LineStrips3D([header.path], colors=[PATH_COLOUR], radii=PATH_RADIUS)
         stream.log(layout.PATH, path, static=True)
+
+
+def _log_obstacles(stream: rr.RecordingStream, header: RecordHeader) -> None:
+    """Send the obstacles, boxes and cylinders apart, with their names."""
+    for kind in (Box, Cylinder):
+        some = [each for each in header.obstacles if isinstance(each, kind)]
+        if not some:
+            continue
+        table, names = np.array([each.prism for each in some]), [each.name for each in some]
+        look: dict[str, Any] = {
+            "centers": table[:, :3], "quaternions": about_z(table[:, 7]), "colors": [OBSTACLE_COLOUR], "labels": names,
+            "fill_mode": "Solid",
+        }  # fmt: skip
+        half, radii = table[:, 3:6], table[:, 6]
+        boxes = kind is Box
+        shape = (
+            rr.Boxes3D(half_sizes=half, **look)
+            if boxes
+            else rr.Cylinders3D(lengths=2 * half[:, 2], radii=radii, **look)
+        )
+        stream.log(f"{layout.OBSTACLES}/{'boxes' if boxes else 'cylinders'}", shape, static=True)
 
 
 def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
