@@ -12,7 +12,7 @@ from cfplan.recording.plausible import check_places, check_times
 _HEAD = 4096  # bytes of a file that identify its format
 
 # Each defines FORMAT, its name; HEAD, which matches a file's first bytes; read(file); and EXTRA, if it needs one.
-IMPORTERS = (usd_log, ros_bag, tlog, named_csv, vicon_csv)
+IMPORTERS = (usd_log, ros_bag, tlog, vicon_csv, named_csv)
 
 
 def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:

@@ -15,6 +15,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.recording.importers.formats import read_log
 from tests.recording.importers import test_import_vicon as vicon
 
@@ -56,6 +57,19 @@ def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.
         log += b"\xff\xff" + stamp(start + time) + struct.pack(codes, *row)
         log += b"\0\0" + stamp(start) + b"\1\0" if other else b""
     return log + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
+
+
+def old_usd(variables, rows, *, block=8):
+    """The log of firmware before 2020: a header of text, and blocks of rows, each with a negated checksum."""
+
+    def checked(part):
+        return part + struct.pack("<I", ~zlib.crc32(part) & 0xFFFFFFFF)
+
+    codes = "<I" + "".join(variable[-2] for variable in variables)
+    packed = [struct.pack(codes, round(1000 * time) + 77, *row) for time, row in zip(TIMES, rows, strict=True)]
+    blocks = [packed[i : i + block] for i in range(0, COUNT, block)]
+    head = bytes([1 + len(variables)]) + ",".join(["tick(I)", *variables, ""]).encode()
+    return checked(head) + b"".join(checked(bytes([len(part)]) + b"".join(part)) for part in blocks)
 
 
 def estimate_rows(seed=0):
@@ -186,6 +200,7 @@ def local(i, *, angles=False):
 ROWS = estimate_rows()[0]
 SOUND = {
     "microSD": usd(ESTIMATE, ROWS),
+    "old microSD": old_usd(ESTIMATE, ROWS),
     "crazyswarm": swarm().encode(),
     "odometry": tlog(lambda i: [odometry(i)]),
     "tlog": tlog(lambda i: [odometry(i), *local(i)]),
@@ -198,6 +213,7 @@ OF_ONE_FILE = [  # format, content, subjects
     ("Crazyflie microSD log", usd(ESTIMATE, ROWS, name="estTDOA"), ["estimate at estTDOA"]),
     ("Crazyflie microSD log", usd(ESTIMATE + MOCAP, np.hstack([estimate_rows(1)[0], ROWS])), ["mocap", "estimate"]),
     ("Crazyflie microSD log", usd(KALMAN, ROWS), ["kalman"]),
+    ("Crazyflie microSD log", SOUND["old microSD"], ["estimate"]),
     ("CSV of t, x, y, z", SOUND["crazyswarm"], ["log"]),
     ("CSV of t, x, y, z", swarm(("qx", "qy", "qz", "qw", "z", "y", "x", "timestamp")).encode(), ["log"]),
     ("MAVLink .tlog", SOUND["odometry"], ["vehicle 7 odometry"]),
@@ -251,6 +267,19 @@ def test_every_type_of_variable_is_read_at_its_place(tmp_path):
     np.testing.assert_allclose(log.subjects[0].position, millimetres / 1000, atol=1e-9)
 
 
+def test_the_compressed_estimate_and_setpoint_are_millimetres_and_a_packed_quaternion(tmp_path):
+    _, position, rotations = estimate_rows()
+    millimetres = np.round(position * 1000).astype(int)
+    names = [f"{group}.{axis}(h)" for group in ("stateEstimateZ", "ctrltargetZ") for axis in "xyz"]
+    packed = compress_quaternion(rotations.as_quat())
+    rows = [(*place, *place, int(quat)) for place, quat in zip(millimetres, packed, strict=True)]
+    estimate, setpoint = read_log(written(tmp_path, usd([*names, "stateEstimateZ.quat(I)"], rows))).subjects
+    assert (estimate.name, setpoint.name) == ("estimate, compressed", "setpoint, compressed")
+    np.testing.assert_allclose([estimate.position, setpoint.position], [millimetres / 1000] * 2, atol=1e-9)
+    assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 0.005
+    assert np.isnan(setpoint.quaternion).all()
+
+
 def test_roll_pitch_and_yaw_are_those_of_the_firmware_whose_pitch_is_nose_up(tmp_path):
     names = [f"stateEstimate.{name}(f)" for name in ("x", "y", "z", "roll", "pitch", "yaw")]
     log = read_log(written(tmp_path, usd(names, [(0, 0, 1, 0, 30, 90)] * COUNT)))
@@ -273,14 +302,15 @@ def test_a_csv_with_other_columns_too_and_without_attitudes_is_places_over_time(
 @pytest.mark.parametrize(
     ("name", "lost", "rows"),
     [
-        ("microSD", 4, 30), ("microSD", 5, 29), ("microSD", 20, 29), ("microSD", 60, 28), ("crazyswarm", 30, 29),
+        ("old microSD", 4, 30), ("old microSD", 5, 29), ("old microSD", 200, 24), ("microSD", 4, 30),
+        ("microSD", 5, 29), ("microSD", 20, 29), ("microSD", 60, 28), ("crazyswarm", 30, 29),
         ("odometry", 5, 29), ("odometry", 200, 29), ("Vicon", 12, 39),
     ],
 )  # fmt: skip
 def test_a_log_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, name, lost, rows):
     log = read_log(written(tmp_path, SOUND[name][:-lost]))
     assert log.truncated
-    assert ("checksum" if name == "microSD" else "cut off") in log.notes[-1]
+    assert ("checksum" if "microSD" in name else "cut off") in log.notes[-1]
     sound = read_log(written(tmp_path, SOUND[name])).subjects[0]
     assert len(log.subjects[0].time) == rows
     np.testing.assert_array_equal(log.subjects[0].position, sound.position[:rows])
@@ -306,16 +336,18 @@ def test_what_is_left_out_of_a_tlog_is_said(tmp_path, content, rows, note):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (usd(["gyro.x(f)"], [(0,)] * COUNT), "no position was logged; the variables are gyro.x, id"),
+        (usd(["gyro.x(f)"], [(0,)] * COUNT), "fixedFrequency has gyro.x; estTDOA has id"),
         (SOUND["microSD"].replace(b"x(f)", b"x(Q)"), "head of the log is damaged"),
         (b"\xbc\x07\x00\x01\x00", "version 7"),
+        (SOUND["old microSD"][:30], "damaged behind byte 0"),
+        (SOUND["old microSD"][:-9] + b"~" + SOUND["old microSD"][-8:], "damaged behind byte"),
         (SOUND["microSD"][:30], "head of the log is damaged or cut off"),
         (SOUND["microSD"][: -38 * COUNT - 4], "ends before its first record"),
         (SOUND["microSD"][:-10] + b"\x12" + SOUND["microSD"][-9:], "checksum is wrong"),
         (SOUND["crazyswarm"].replace(b",qz", b"", 1), ":1: .*no column qz"),
         (SOUND["crazyswarm"].replace(b"0.01", b"soon", 1), ":3: 'soon.*in column 1 is not a number"),
         (SOUND["crazyswarm"].replace(b"\n", b",1\n", 3), ":4: 8 cells, 9"),
-        (SOUND["crazyswarm"].split(b"\n")[0] + b"\n", "no pose"),
+        (SOUND["crazyswarm"].split(b"\n")[0] + b"\n", "no rows of numbers below the header"),
         (tlog(lambda i: [HEARTBEAT]), "no pose"),
         (b"", "the file is empty"),
         *((content, "unknown format") for content in (b"a picture", b"\x00" * 100, b"Objects\n")),
@@ -399,7 +431,7 @@ def test_damage_anywhere_is_an_error_with_its_place_and_a_hint_or_a_log(tmp_path
         assert log.hint
         assert "\n" not in str(log)
         return
-    assert log.truncated or (name, kind) != ("microSD", "flipped bit")  # its checksum tells
+    assert log.truncated or kind != "flipped bit" or "microSD" not in name  # its checksum tells
     for subject in log.subjects:
         assert subject.position.shape == (len(subject.time), 3)
         assert np.all(np.diff(subject.time) > 0)
