@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.files.text import TIMES, is_number
+from cfplan.files.text import TIMES, UNITS, is_number
 from cfplan.recording.importers.csv_numbers import decimal_point, line_at, read_numbers
 from cfplan.recording.importers.mocap_log import (
     MATRIX,
@@ -40,10 +40,6 @@ HEAD = re.compile(
 )
 _FIRST_ROW = re.compile(rb"^" + _ROW, re.MULTILINE)
 _CELL = re.compile(r"[\s\"']*(.*?)\s*(?:[\[(](.*)[\])])?[\s\"']*")  # a name, and its unit
-_UNITS = {
-    "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9,
-    "m": 1.0, "cm": 1e-2, "mm": 1e-3, "meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3,
-}  # fmt: skip
 _HINT = "the first line must name the columns t, x, y, z and, for attitudes, qx, qy, qz and qw"
 
 
@@ -136,21 +132,21 @@ def _named(line: str, row: Sequence[str], delimiter: str, where: str) -> _Head:
     if (not text or line.lstrip().startswith("#")) and not set(TIMES) & set(names) and len(row) in _UNNAMED:
         names = _UNNAMED[len(row)]
         units, notes = ("",) * len(names), (f"no line names the columns: taken as {', '.join(names)}",)
-    if unknown := [unit for unit in units if unit and unit not in _UNITS and set(units) & set(_UNITS)]:
-        raise InputError(f"the unit {unknown[0]!r} is unknown", where=where, hint=f"known: {', '.join(_UNITS)}")
+    if unknown := [unit for unit in units if unit and unit not in UNITS and set(units) & set(UNITS)]:
+        raise InputError(f"the unit {unknown[0]!r} is unknown", where=where, hint=f"known: {', '.join(UNITS)}")
     times = [name for name in TIMES if name in names]
     for form, (unit, layout) in LAYOUTS.items():
         subjects = {}
         for subject_name, columns in layout.items():
             found = {c: (names.index(key), k) for c, (key, k) in columns.items() if key in names}
             if found.keys() >= set(PLACE):
-                subjects[subject_name] = {c: (i, k * _UNITS.get(units[i], 1.0)) for c, (i, k) in found.items()}
+                subjects[subject_name] = {c: (i, k * UNITS.get(units[i], 1.0)) for c, (i, k) in found.items()}
                 missing = [columns[c][0] for c in QUATERNION if c in columns and c not in found]
                 if form != "cfclient log" and 0 < len(missing) < len(QUATERNION):
                     raise InputError(f"there is no column {', '.join(missing)}", where=where, hint=_HINT)
         if subjects and times:
             time = names.index(times[0])
-            return _Head(form, subjects, time, _UNITS.get(units[time], unit), notes=notes)
+            return _Head(form, subjects, time, UNITS.get(units[time], unit), notes=notes)
     missing = [name for name in PLACE if name not in names] + ["t"] * (not times)
     listed = ", ".join(filter(None, names[:12]))
     raise InputError(
@@ -170,15 +166,15 @@ def _motive(lines: Sequence[str], where: str) -> _Head:
         first, *rows, axes = csv.reader(lines)
     unit = dict(zip(first[::2], first[1::2], strict=False)).get("Length Units", "Meters").lower()
     times = [column for column, axis in enumerate(axes) if axis.lower().startswith("time")]
-    if unit not in _UNITS or len(rows) < 3 or not times:
-        message = f"the unit of lengths is {unit[:20]!r}" if unit not in _UNITS else "the head is not that of Motive"
+    if unit not in UNITS or len(rows) < 3 or not times:
+        message = f"the unit of lengths is {unit[:20]!r}" if unit not in UNITS else "the head is not that of Motive"
         raise InputError(message, where=where, hint="export it again, in meters and with its header")
     found: dict[str, dict[str, int]] = {}
     for column, (kind, name, what, axis) in enumerate(zip(rows[0], rows[1], rows[-1], axes, strict=False)):
         if kind in ("Rigid Body", "Marker"):
             found.setdefault(name, {})[f"{what} {axis}"] = column
     subjects = {
-        name: {c: (there[k], u * (_UNITS[unit] if c in PLACE else 1)) for c, (k, u) in _MOTIVE.items() if k in there}
+        name: {c: (there[k], u * (UNITS[unit] if c in PLACE else 1)) for c, (k, u) in _MOTIVE.items() if k in there}
         for name, there in found.items()
         if {"Position X", "Position Y", "Position Z"} <= there.keys()
     }
