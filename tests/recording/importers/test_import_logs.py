@@ -157,6 +157,7 @@ def bag_of_poses(folder, storage):
 
 TO_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 TO_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+GLOBAL = common.MAVLink_global_position_int_message(0, 500000000, 80000000, 1000, 1000, 0, 0, 0, 0)
 HEARTBEAT = common.MAVLink_heartbeat_message(2, 0, 0, 0, 4, 3)
 
 
@@ -348,7 +349,8 @@ def test_what_is_left_out_of_a_tlog_is_said(tmp_path, content, rows, note):
         (SOUND["crazyswarm"].replace(b"0.01", b"soon", 1), ":3: 'soon.*in column 1 is not a number"),
         (SOUND["crazyswarm"].replace(b"\n", b",1\n", 3), ":4: 8 cells, 9"),
         (SOUND["crazyswarm"].split(b"\n")[0] + b"\n", "no rows of numbers below the header"),
-        (tlog(lambda i: [HEARTBEAT]), "no pose"),
+        (tlog(lambda i: [HEARTBEAT]), "no pose .*no positions; LOCAL_POSITION_NED"),
+        (tlog(lambda i: [GLOBAL, HEARTBEAT]), "no pose .*global positions only; LOCAL_POSITION_NED and ODOMETRY"),
         (b"", "the file is empty"),
         *((content, "unknown format") for content in (b"a picture", b"\x00" * 100, b"Objects\n")),
     ],
