@@ -1,6 +1,7 @@
 """Logs of every format: written here by their layouts, read back equal; damaged ones are named or read in part."""
 
 import math
+import sqlite3
 import struct
 import sys
 import zlib
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from pymavlink.dialects.v20 import common
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -130,6 +132,7 @@ def pose(i, seed=0):
     return estimate_rows(seed)[0][i]
 
 
+LEVEL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 COVARIANCE = np.zeros(36)
 MESSAGES = {  # the first subject, and the fields of a message
     "geometry_msgs/msg/PoseStamped": ("/cf1/pose", lambda i: [*stamp(i), pose(i)]),
@@ -257,6 +260,79 @@ def test_a_file_of_a_bag_may_stand_alone_under_its_suffix(tmp_path, storage):
     assert_same(read_log(file).subjects[0])
     with pytest.raises(InputError, match="suffix"):
         read_log(file.rename(tmp_path / "log"))
+
+
+@pytest.mark.parametrize("storage", SUFFIXES)
+def test_a_folder_without_metadata_is_read_by_its_files(tmp_path, storage):
+    place, _ = bag_of_poses(tmp_path, storage)
+    (place / "metadata.yaml").unlink()
+    assert_same(read_log(place).subjects[0])
+
+
+def test_a_bag_without_definitions_of_its_messages_as_humble_writes_holds_the_poses_of_crazyswarm2(tmp_path):
+    kind = NAMED_POSE + "Array"
+    place = bag(tmp_path / "bag", "/poses", kind, MESSAGES[kind][1])
+    (file,) = place.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.execute("UPDATE schema SET schema_version = 3")
+    database.close()
+    assert_same(read_log(place).subjects[0])
+
+
+def transforms(*frames):
+    """A message of transforms: (parent, child, pose (7,)) each."""
+    return lambda i: [
+        len(frames),
+        *(part for above, name, at in frames for part in (*stamp(i)[:2], above, name, at(i))),
+    ]
+
+
+def test_frames_of_transforms_are_composed_and_those_of_several_roots_are_told(tmp_path):
+    aside = np.array([0.1, 0.0, 0.0, *Rotation.from_euler("z", 90, degrees=True).as_quat()])
+    frames = [("world", "cf1", pose), ("cf1", "deck", lambda _: LEVEL), ("deck", "camera", lambda _: aside)]
+    other = ("/map", "gate", lambda _: LEVEL)
+    kind = "tf2_msgs/msg/TFMessage"
+    log = read_log(bag(tmp_path / "bag", "/tf", kind, transforms(*frames, other)))
+    cf1, deck, camera = log.select(["cf1", "deck", "camera"])
+    np.testing.assert_allclose(deck.position, cf1.position, atol=1e-9)
+    turned = Rotation.from_quat(cf1.quaternion)
+    np.testing.assert_allclose(camera.position, cf1.position + turned.apply(aside[:3]), atol=1e-9)
+    np.testing.assert_allclose(
+        Rotation.from_quat(camera.quaternion).apply([1, 0, 0]), turned.apply([0, 1, 0]), atol=1e-9
+    )
+    assert "the frames map, world" in log.notes[0]
+
+
+def test_a_static_transform_follows_its_moving_parent(tmp_path):
+    def message(i):
+        return transforms(("world", "cf1", pose), *([("cf1", "deck", lambda _: LEVEL)] if i == 0 else []))(i)
+
+    cf1, deck = read_log(bag(tmp_path / "bag", "/tf", "tf2_msgs/msg/TFMessage", message)).subjects
+    np.testing.assert_allclose(deck.time, cf1.time)
+    np.testing.assert_allclose(deck.position, cf1.position, atol=1e-9)
+
+
+def test_an_mcap_bag_that_is_cut_off_is_read_up_to_its_last_complete_chunk(tmp_path):
+    kind = "geometry_msgs/msg/PoseStamped"
+    file = tmp_path / "bag.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream, chunk_size=1000)
+        writer.start(profile="ros2", library="")
+        schema = writer.register_schema(kind, "ros2msg", store().generate_msgdef(kind)[0].encode())
+        channel = writer.register_channel("/cf1/pose", "cdr", schema)
+        for i in range(COUNT):
+            writer.add_message(channel, round((START + TIMES[i]) * 1e9), cdr(*MESSAGES[kind][1](i)), 0)
+        writer.finish()
+    content = file.read_bytes()
+    assert_same(read_log(file).subjects[0])
+    file.write_bytes(content[: len(content) // 2])
+    log = read_log(file)
+    rows = len(log.subjects[0].time)
+    assert log.truncated
+    assert "cut off" in log.notes[0]
+    assert 5 < rows < COUNT
+    np.testing.assert_array_equal(log.subjects[0].position, poses()[0][:rows])
 
 
 def test_every_type_of_variable_is_read_at_its_place(tmp_path):
