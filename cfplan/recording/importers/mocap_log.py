@@ -123,8 +123,12 @@ def _unit_quaternions(quaternion: NDArray) -> NDArray:
         return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)
 
 
-def _from_matrix(values: NDArray) -> Rotation:
-    return Rotation.from_matrix(values.reshape(-1, 3, 3).transpose(0, 2, 1))
+def _from_matrices(values: NDArray) -> NDArray:
+    """Return rotation matrices, (N, 9) by columns, as quaternions, (N, 4), NaN where one is no rotation."""
+    matrices = values.reshape(-1, 3, 3).transpose(0, 2, 1)
+    with np.errstate(all="ignore"):
+        rotations = np.where((np.linalg.det(matrices) > 0)[:, None], values, np.nan)
+    return quaternions(rotations, lambda known: Rotation.from_matrix(known.reshape(-1, 3, 3).transpose(0, 2, 1)))
 
 
 def _from_compressed(values: NDArray) -> Rotation:
@@ -136,7 +140,7 @@ _ATTITUDES: dict[tuple[str, ...], Callable[[NDArray], NDArray]] = {  # the first
     YAW_PITCH_ROLL: partial(quaternions, rotation=partial(Rotation.from_euler, "ZYX")),
     ROTATION_VECTOR: partial(quaternions, rotation=Rotation.from_rotvec),
     EULER_XYZ: partial(quaternions, rotation=partial(Rotation.from_euler, "XYZ")),
-    MATRIX: partial(quaternions, rotation=_from_matrix),
+    MATRIX: _from_matrices,
     COMPRESSED: partial(quaternions, rotation=_from_compressed),
 }
 

@@ -126,7 +126,7 @@ def read(file: Path) -> MocapLog:
 def _named(line: str, row: Sequence[str], delimiter: str, where: str) -> _Head:
     """Return the columns that the line names; or those of a file whose columns are not named."""
     text = line.strip().lstrip("#").strip()
-    named = [_CELL.fullmatch(cell) for cell in (text.split() if delimiter == " " else text.split(delimiter))]
+    named = [_CELL.fullmatch(cell) for cell in (text.split() or [""] if delimiter == " " else text.split(delimiter))]
     names, units = zip(*((cell[1].lower(), (cell[2] or "").lower()) for cell in named if cell), strict=True)
     notes: tuple[str, ...] = ()
     if (not text or line.lstrip().startswith("#")) and not set(TIMES) & set(names) and len(row) in _UNNAMED:
@@ -188,9 +188,9 @@ def _qtm(lines: Sequence[str], width: int, where: str) -> _Head:
     """Return the columns of the bodies or the markers in an export of Qualisys Track Manager, at a fixed rate."""
     entries = {key: values for key, *values in (line.rstrip("\t").split("\t") for line in lines)}
     key = next((key for key in _QTM if key in entries), "")
-    rate = entries.get("FREQUENCY", [""])[0]
+    rate = (entries.get("FREQUENCY") or [""])[0]
     size, columns = _QTM.get(key, (0, {}))
-    names = [name for name in entries.get(key, []) if name]
+    names = [name for name in entries.get(key, []) if name] if key else []
     before = 2 if lines[-1].startswith("Frame\t") else 0  # Frame and Time
     if not names or not is_number(rate) or not float(rate) > 0 or width < before + size * len(names):
         message = "no bodies or markers with a frequency and all their columns"

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
@@ -133,3 +135,27 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path, content, message):
     with pytest.raises(InputError, match=message) as caught:
         read(tmp_path, content)
     assert caught.value.where.startswith(str(tmp_path / "cf1.csv:"))
+
+
+patches = st.sampled_from(
+    ["", "\n", "\n\n", ",", ";", "\t", '"', "#", "soon", "1e999", "\0", "-", "[h]", "nan", ",,,\n"]
+)
+
+
+@settings(deadline=None, max_examples=200)
+@given(name=st.sampled_from(sorted(READ)), patch=patches, data=st.data())
+def test_damage_anywhere_is_an_error_with_its_place_and_a_hint_or_a_log(tmp_path_factory, name, patch, data):
+    content = READ[name][1].replace("~", S)
+    begin = data.draw(st.integers(0, len(content)))
+    rest = content[begin + data.draw(st.integers(0, 40)) :] if data.draw(st.booleans()) else ""
+    try:
+        log = read(tmp_path_factory.mktemp("damaged"), content[:begin] + patch + rest)
+    except InputError as error:
+        log = error
+    if isinstance(log, InputError):
+        assert log.where
+        assert log.hint
+        return
+    for subject in log.subjects:
+        assert subject.position.shape == (len(subject.time), 3)
+        assert np.all(np.diff(subject.time) > 0)
