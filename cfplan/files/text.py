@@ -20,6 +20,11 @@ TIMES = ("t", "time", "timestamp")  # possible names of the time column
 _MAX_UNIX_TIME = 1e10  # s since 1970: beyond this a time is in other units
 PIPE_PATIENCE = 5.0  # s without a byte
 DECIMAL_COMMA_HINT = "write decimals with a point, as 1.5, and the same separator between all numbers"
+UNITS = {  # in SI
+    "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9,
+    "m": 1.0, "cm": 1e-2, "mm": 1e-3, "meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3,
+}  # fmt: skip
+_UNIT = re.compile(r"\s*\[\s*([^\]]*?)\s*\]")  # behind a name
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
@@ -89,29 +94,36 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
     return np.array(rows), [number for number, _ in lines]
 
 
-def read_timed_table(file: pathlib.Path, names: Sequence[str], more: str) -> tuple[NDArray, list[int], list[str]]:
-    """Read rows of a time, s, and `names`; the line number of each; and the columns that the file has besides.
+def read_named_table(
+    file: pathlib.Path, names: Sequence[str], what: str, *, more: str = ""
+) -> tuple[NDArray, list[int], list[str]]:
+    """Read rows of the columns `names` in SI; the line number of each; and the columns that the file has besides.
 
-    A first line that names all of them, in any case, says where they are. Otherwise they are the first columns, in this
-    order, and one column may follow that is called `more`. Times may count from 1970.
+    A first line that names all of them, in any case, says where they are and, as in `x [mm]`, in which unit. Otherwise
+    they are the only columns, in this order, but for one that is called `more` and may follow. The name `t` stands for
+    a time, which may count from 1970: a file that names one is for `names` with it alone.
 
     Raises:
-        InputError: as read_table().
+        InputError: as read_table(); an unknown unit.
     """
-    what = ", ".join(("t", *names))
     header, lines = _split(file, what)
-    heads = [cell.strip("\"'").lower() for cell in header]
-    time = next((name for name in TIMES if name in heads), None)
-    if time is None or not set(names) <= set(heads):
-        time, heads = "t", ["t", *names]
-        heads += [more] if len(lines[0][1]) == len(heads) + 1 and lines[0][1][-1] else []
-        what += "; or name the columns so in the first line"
-    columns = [heads.index(name) for name in (time, *names)]
-    rows = [
-        _numbers(cells, columns, len(heads), what, f"{file}:{number}", first=_MAX_UNIX_TIME) for number, cells in lines
-    ]
-    others = [name for column, name in enumerate(heads) if column not in columns and name]
-    return np.array(rows), [number for number, _ in lines], others
+    heads = [cell.strip("\"'").lower().partition("[") for cell in header]
+    found = ["t" if name in TIMES else name for name, _, _ in heads]
+    units = [unit.rstrip("]") for _, _, unit in heads]
+    if not set(names) <= set(found) or ("t" in found) != ("t" in names):
+        found = [*names, more] if more and len(lines[0][1]) == len(names) + 1 and lines[0][1][-1] else [*names]
+        units = [""] * len(found)
+    columns = [found.index(name) for name in names]
+    if unknown := [units[column] for column in columns if units[column] and units[column] not in UNITS]:
+        raise InputError(f"the unit {unknown[0]!r} is unknown", where=str(file), hint=f"known: {', '.join(UNITS)}")
+    most = _MAX_UNIX_TIME if names[0] == "t" else MAX_NUMBER
+    rows = [_numbers(cells, columns, len(found), what, f"{file}:{number}", first=most) for number, cells in lines]
+    others = [name for column, name in enumerate(found) if column not in columns and name]
+    return (
+        np.array(rows) * [UNITS.get(units[column], 1.0) for column in columns],
+        [number for number, _ in lines],
+        others,
+    )
 
 
 def _split(file: pathlib.Path, what: str) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -123,6 +135,8 @@ def _split(file: pathlib.Path, what: str) -> tuple[list[str], list[tuple[int, li
         if not text or text.startswith("#"):
             continue
         cells = _SEPARATOR.split(text)
+        if not header and not rows and "[" in text:  # units
+            cells = _SEPARATOR.split(_UNIT.sub(r"[\1]", text))
         if not header and not rows and not any(is_number(cell) for cell in cells):
             header = cells
             continue

@@ -33,7 +33,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from cfplan.errors import InputError
-from cfplan.files.text import read_table, read_timed_table
+from cfplan.files.text import read_named_table
 from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
 from cfplan.geometry.min_snap import (
     MIN_DENSE_SPACING,
@@ -322,15 +322,15 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
 
 def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
     """Return path and waypoints, and a word if these are rather samples of a curve."""
-    rows = _read_points(places, content.points, MIN_SPACING)
+    rows, left_out = _read_points(places, content.points, MIN_SPACING)
     points = _repeated(rows, content.laps, places)
     words = (f"{len(rows)} rows are waypoints here: write `curve: {content.points}` if they are samples of a curve",)
     path = _path_with(_least_snap(content), points, str(_beside(places, content.points)))
-    return path, points, *(words if len(rows) >= _MANY_WAYPOINTS else ())
+    return path, points, *(words if len(rows) >= _MANY_WAYPOINTS else ()), *left_out
 
 
-def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
-    points = _read_points(places, content.curve, MIN_DENSE_SPACING)
+def _from_curve(content: _Content, places: Places) -> tuple[Any, ...]:
+    points, left_out = _read_points(places, content.curve, MIN_DENSE_SPACING)
     if len(points) < _LEAST_SAMPLED:
         raise InputError(
             f"a curve needs at least {_LEAST_SAMPLED} samples, not {len(points)}",
@@ -338,7 +338,7 @@ def _from_curve(content: _Content, places: Places) -> tuple[Path, NDArray]:
             hint="add rows x, y, z to the file, or write `points:` if they are waypoints",
         )
     points = _repeated(points, content.laps, places)
-    return _path_with(smooth_through, points, str(_beside(places, content.curve))), points
+    return _path_with(smooth_through, points, str(_beside(places, content.curve))), points, *left_out
 
 
 def _least_snap(content: _Content) -> Callable[[NDArray], Path]:
@@ -354,10 +354,11 @@ def _nominal(points: NDArray) -> NDArray:
     return times * (np.linalg.norm(np.diff(points, axis=0), axis=1).sum() / times.sum())
 
 
-def _read_points(places: Places, name: str | None, spacing: float) -> NDArray:
-    """Return two points or more, (K, 3) m, `spacing`, m, apart or more, from a file beside the path file."""
+def _read_points(places: Places, name: str | None, spacing: float) -> tuple[NDArray, tuple[str, ...]]:
+    """Return two points or more, (K, 3) m, `spacing`, m, apart or more, from a file beside; and what it leaves out."""
     file = _beside(places, name)
-    points, lines = read_table(file, 3, "x, y, z; write `samples:` for rows of t, x, y, z")
+    what = "x, y, z; write `samples:` for rows of t, x, y, z"
+    points, lines, others = read_named_table(file, ("x", "y", "z"), what)
     if len(points) < 2:
         raise InputError(
             f"a path needs at least two points, not {len(points)}", where=str(file), hint="add rows x, y, z to the file"
@@ -365,17 +366,22 @@ def _read_points(places: Places, name: str | None, spacing: float) -> NDArray:
     many = spacing == MIN_SPACING and len(points) >= _MANY_WAYPOINTS
     hint = f"write `curve: {name}` if the rows are samples of a curve, or remove one of them" if many else REMOVE_HINT
     check_points(points, spacing, lambda index: f"{file}:{lines[index]}", hint)
-    return points
+    return points, _left_out(others)
 
 
-def _from_polynomials(content: _Content, places: Places) -> tuple[Path, NDArray]:
+def _left_out(columns: list[str]) -> tuple[str, ...]:
+    return (f"columns are not used: {', '.join(columns)}",) if columns else ()
+
+
+def _from_polynomials(content: _Content, places: Places) -> tuple[Any, ...]:
     return read_polynomials(_beside(places, content.polynomials), laps=content.laps)
 
 
 def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
     """Return path and points, and what is lost."""
     file = _beside(places, content.samples)
-    rows, lines, others = read_timed_table(file, ("x", "y", "z"), "yaw")
+    what = "t, x, y, z; or name the columns so in the first line"
+    rows, lines, others = read_named_table(file, ("t", "x", "y", "z"), what, more="yaw")
     rows[:, 0] -= rows[0, 0]
     motion = timed_samples(rows, lines, str(file))
     points = _repeated(motion.points(), content.laps, places)
@@ -387,8 +393,7 @@ def _from_samples(content: _Content, places: Places) -> tuple[Any, ...]:
             hint="give a longer motion, or list waypoints",
         )
     path = _path_with(smooth_through, points, str(file))
-    left_out = (f"columns are not used: {', '.join(others)}",) if others else ()
-    return path, points, *motion.losses(path), *left_out
+    return path, points, *motion.losses(path), *_left_out(others)
 
 
 _SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {

@@ -67,10 +67,7 @@ class TimedSamples:
         gap = float(np.diff(self.time).max())
         if gap > _LONGEST_GAP:
             told.append(f"nothing is known for {gap:.1f} s before {self.time[1 + np.argmax(np.diff(self.time))]:.1f} s")
-        dense = path(np.linspace(0.0, path.end, max(2, int(path.length / 0.005))))
-        from scipy.spatial import KDTree  # slow to import
-
-        off = KDTree(dense).query(self.position)[0]
+        off = distances(path, self.position)
         told.append(
             f"samples lie up to {1000 * off.max():.0f} mm from the path, {1000 * np.median(off):.1f} mm in median"
         )
@@ -120,6 +117,17 @@ def timed_samples(rows: NDArray, lines: list[int], file: str) -> TimedSamples:
             f"the motion stays within {extent:.3f} m", where=file, hint="give metres, and a motion that goes somewhere"
         )
     return TimedSamples(time, position)
+
+
+def distances(path: Path, position: NDArray) -> NDArray:
+    """Return how far positions, (N, 3) m, are from a path, (N,) m."""
+    from scipy.spatial import KDTree  # slow to import
+
+    s = np.linspace(0.0, path.end, max(2, int(path.length / 0.005)))
+    nearest = s[KDTree(path(s)).query(position)[1]]
+    off, tangent = position - path(nearest), path(nearest, 1)
+    along = np.sum(off * tangent, axis=1) / np.maximum(np.sum(tangent**2, axis=1), 1e-12)  # 0 at the ends, at rest
+    return np.asarray(np.linalg.norm(off - along[:, None] * tangent, axis=1))
 
 
 def _chain(position: NDArray, least: float) -> NDArray:

@@ -132,6 +132,45 @@ def test_the_key_says_whether_rows_are_waypoints_or_samples_and_no_count_does(lo
     assert waypoints.losses == samples.losses == ()
 
 
+@pytest.mark.parametrize("key", ["points", "curve"])
+def test_columns_that_are_named_are_found_and_others_are_reported(load, key):
+    rows = circle(8)
+    named = "".join(f"0.3,{1000 * x},{y},{z}\n" for x, y, z in rows)
+    flight = load(f"{key}: rows.csv\n", rows=f"yaw,x [mm],Y,z [m]\n{named}")
+    np.testing.assert_allclose(flight.waypoints, rows, atol=1e-12)
+    assert flight.losses == ("columns are not used: yaw",)
+    with pytest.raises(InputError, match=r"4 numbers, not 3 .*write `samples:`"):
+        load(f"{key}: rows.csv\n", rows=f"t,x,y,z\n{named}")
+
+
+def test_samples_of_skybrush_are_in_milliseconds(load):
+    rows = "".join(f"{250 * i},{0.1 * i},0,1,255,0,0\n" for i in range(20))
+    flight = load("samples: cue.csv\n", cue=f'"Time [msec]","x [m]","y [m]","z [m]",Red,Green,Blue\n{rows}')
+    assert flight.path.length == pytest.approx(1.9, abs=0.01)
+    assert "4.8 s of 20 samples" in flight.losses[0]
+    assert flight.losses[-1] == "columns are not used: red, green, blue"
+    with pytest.raises(InputError, match=r"the unit 'h' is unknown \(hint: known: s, "):
+        load("samples: cue.csv\n", cue=f"t [h],x,y,z,a,b,c\n{rows}")
+
+
+def test_polynomials_whose_snap_jumps_are_drawn_smoothly_and_those_whose_jerk_jumps_are_refused(load):
+    def pieces(power):
+        """1 s along x, then 1 s more that leaves aside with a derivative of this order."""
+        first, second = np.zeros((2, 4, 8))
+        first[0, 1], second[0, :2] = 1.0, 1.0
+        second[1, power] = 0.5 / math.factorial(power)
+        return "".join("1.0," + ",".join(f"{value:.9f}" for value in piece.ravel()) + "\n" for piece in (first, second))
+
+    flight = load("polynomials: two.csv\n", two=pieces(4))
+    assert "snap jumps at 1 of 1 joints: drawn smoothly" in flight.losses[0]
+    np.testing.assert_allclose(flight.waypoints, [[0, 0, 0], [1, 0, 0], [2, 0.5 / 24, 0]], atol=1e-8)
+    for time in np.linspace(0.0, 1.0, 11):
+        near = flight.path(np.linspace(0, flight.path.end, 20_001)) - [1 + time, 0.5 * time**4 / 24, 0]
+        assert np.linalg.norm(near, axis=1).min() < 1e-4
+    with pytest.raises(InputError, match=r"jerk jumps by 0\.5 "):
+        load("polynomials: two.csv\n", two=pieces(3))
+
+
 def test_many_waypoints_recall_the_curve(load):
     flight = load("points: rows.csv\nshape: fastest\n", rows=table(circle(50)))
     assert flight.losses == ("50 rows are waypoints here: write `curve: rows.csv` if they are samples of a curve",)

@@ -125,6 +125,15 @@ def open_connection(host: str, port: int, where: str, hint: str) -> socket.socke
         raise LinkError(f"{host} port {port}: {why.strerror or why}", where=where, hint=hint) from why
 
 
+def address_of(host: str, port: int, where: str) -> str:
+    """Return the address of a computer in numbers, of version 4 if it has one. Raises InputError on an unknown name."""
+    try:
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    except (socket.gaierror, UnicodeError) as why:
+        raise unknown_name(host, where) from why
+    return str(min(found, key=lambda entry: entry[0] != socket.AF_INET)[4][0])
+
+
 def unknown_name(host: str, where: str) -> InputError:
     """Return the error of an unknown computer."""
     return InputError(

@@ -12,7 +12,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError, LinkError
-from cfplan.flight.mocap.datastream_client import DataStreamClient, open_connection
+from cfplan.flight.mocap.datastream_client import DataStreamClient, address_of, open_connection
 from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
 from cfplan.flight.mocap.uri import MocapUri
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     import motioncapture
 
 _SCENE_TIMEOUT = 0.5  # s to hear of the subjects
+_NAMES = {"vicon-sdk": "vicon", "optitrack-sdk": "optitrack_closed_source"}  # in the package, where others than ours
 
 
 class SdkDriver:
@@ -43,6 +44,7 @@ class SdkDriver:
                 where=str(self._uri),
                 hint="pip install 'cfplan[mocap]'" + ("; or use vicon://, which does not need it" * self._is_vicon),
             ) from why
+        address = address_of(self._uri.host, self._uri.port, str(self._uri))  # not every client knows names
         if self._is_vicon:
             self._scene = self._read_scene()
         elif self._uri.system == "qualisys":
@@ -50,8 +52,16 @@ class SdkDriver:
                 self._uri.host, self._uri.port, str(self._uri), "is Qualisys Track Manager running there, in real time?"
             ).close()
         try:
-            self._client = motioncapture.connect(self._uri.system.removesuffix("-sdk"), self._settings())
+            self._client = motioncapture.connect(
+                _NAMES.get(self._uri.system, self._uri.system), self._settings(address)
+            )
         except RuntimeError as why:
+            if "Unknown motion capture type" in str(why):
+                raise InputError(
+                    f"the installed package motioncapture is built without {self._uri.system}",
+                    where=str(self._uri),
+                    hint="build libmotioncapture from source with the maker's SDK, or let the system send by vrpn://",
+                ) from why
             raise LinkError(str(why), where=str(self._uri), hint="is the system running there?") from why
 
     def wait(self) -> Frame:
@@ -81,13 +91,16 @@ class SdkDriver:
     def _is_vicon(self) -> bool:
         return self._uri.system == "vicon-sdk"
 
-    def _settings(self) -> dict[str, str]:
-        host, port = self._uri.host, str(self._uri.port)
+    def _settings(self, host: str) -> dict[str, str]:
+        port = str(self._uri.port)
         return {
             # The misspelling is the package's; it turns the cloud of unlabelled markers off.
             "vicon-sdk": {"hostname": f"{host}:{port}", "enable_pointclout": "0"},
             "qualisys": {"hostname": host, "port": port, "enable_pointclout": "0"},
             "optitrack": {"hostname": host, "port_command": port},
+            "optitrack-sdk": {"hostname": host, "port_command": port},
+            "nokov": {"hostname": host},
+            "motionanalysis": {"hostname": host},
             "vrpn": {"hostname": f"{host}:{port}"},
         }[self._uri.system]
 

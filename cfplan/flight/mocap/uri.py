@@ -8,12 +8,15 @@ from urllib.parse import unquote, urlsplit
 from cfplan.errors import InputError, LinkError
 
 VICON_PORT = 801
-# Scheme and default port.
-SYSTEMS: dict[str, int | None] = {
+# Scheme and default port, 0 where the maker's client takes none.
+SYSTEMS = {
     "vicon": VICON_PORT,  # cfplan's own client of Vicon's DataStream
     "vicon-sdk": VICON_PORT,  # the same server through Vicon's own client
     "qualisys": 22222,
     "optitrack": 1510,
+    "optitrack-sdk": 1510,
+    "nokov": 0,
+    "motionanalysis": 0,
     "vrpn": 3883,
 }
 EXAMPLE = "vicon://192.168.1.2/cf1"
@@ -26,7 +29,7 @@ class MocapUri:
 
     system: str  # one of SYSTEMS
     host: str
-    port: int
+    port: int  # 0 where the maker's client takes none
     subject: str  # "" where no body is named
 
     def __str__(self) -> str:
@@ -72,8 +75,9 @@ def parse_uri(text: str, *, subject_needed: bool) -> MocapUri:
         raise InputError(
             "which body is the vehicle?", where=text, hint=f"write it as {EXAMPLE}; `cfplan mocap {text}` lists them"
         )
-    if port == 0:
-        raise InputError("there is no port 0", where=text, hint=f"leave it out for {usual}")
+    if port == 0 or (port and not usual):
+        message = "there is no port 0" if port == 0 else f"the client of {parts.scheme} takes no port"
+        raise InputError(message, where=text, hint=f"leave it out for {usual}" if usual else "leave it out")
     return MocapUri(parts.scheme, host, port or usual, subject)
 
 

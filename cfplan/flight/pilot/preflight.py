@@ -30,6 +30,7 @@ OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
 _WAY_STEP = 0.01  # m, between the places that are looked at on the way to the start
+LARGEST_HEIGHT = 0.3  # m of the tracked body from the floor: a box may be as high
 LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors lean by less
 
 
@@ -242,6 +243,16 @@ def check_tilt(snapshot: PreflightSnapshot) -> Check:
     )  # fmt: skip
 
 
+def check_height(snapshot: PreflightSnapshot) -> Check:
+    """A body that was defined where it stands is level with any axis up; its height shows which one is."""
+    height = snapshot.poses[-1].position[2] - snapshot.mission.limits.space.low[2]
+    return Check(
+        "height of the body", f"{shown(height, '.2f')} m above the floor", f"within {LARGEST_HEIGHT:.1f} m",
+        abs(height) <= LARGEST_HEIGHT,
+        "is z up in motion capture, not y, and is z = 0 its floor? Lift the vehicle by hand: only z must change",
+    )  # fmt: skip
+
+
 def check_variance(snapshot: PreflightSnapshot) -> Check:
     worst = max(snapshot.variance)
     return Check(
@@ -320,6 +331,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
     check_standing,
     check_yaw_agreement,
     check_tilt,
+    check_height,
     check_variance,
     check_start_place,
     check_way_to_start,

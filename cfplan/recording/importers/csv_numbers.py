@@ -13,7 +13,7 @@ from cfplan.errors import InputError
 
 _BLOCK = 1 << 20  # bytes per task, which fit into a core's cache
 _LONGEST_CELL = 64  # bytes
-_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)"]  # contents of a cell without a value
+_NO_NUMBER = ["", " ", "NaN", "nan", "-nan", "NA", "-nan(ind)", "NULL"]  # contents of a cell without a value
 _NUMBER = re.compile(r"[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|inf(inity)?)", re.IGNORECASE | re.ASCII)
 
 
@@ -50,6 +50,11 @@ def read_numbers(
             return read_numbers(data, begin, last, columns, width, where, delimiter=delimiter, point=point)[0], True
         raise _mistake(data, begin, end, columns, width, where, delimiter, point) from None
     return {column: values.to_numpy() for column, values in zip(columns, table.columns, strict=True)}, False
+
+
+def decimal_point(data: bytes, begin: int, end: int, delimiter: str) -> str:
+    """Return the decimal separator of numbers that `delimiter` separates."""
+    return "," if delimiter != "," and data.count(b",", begin, end) > data.count(b".", begin, end) else "."
 
 
 def line_at(data: bytes, offset: int) -> int:

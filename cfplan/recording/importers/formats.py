@@ -12,7 +12,7 @@ from cfplan.recording.plausible import check_places, check_times
 _HEAD = 4096  # bytes of a file that identify its format
 
 # Each defines FORMAT, its name; HEAD, which matches a file's first bytes; read(file); and EXTRA, if it needs one.
-IMPORTERS = (usd_log, ros_bag, tlog, named_csv, vicon_csv)
+IMPORTERS = (usd_log, ros_bag, tlog, vicon_csv, named_csv)
 
 
 def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
@@ -42,7 +42,7 @@ def read_log(file: Path, *, rotations: Rotations | None = None) -> MocapLog:
 
 def find_importer(file: Path) -> ModuleType:
     """Return the importer that recognises the file. Raises InputError if it is absent, empty, or of unknown format."""
-    if (file / "metadata.yaml").is_file():
+    if file.is_dir() and (ros_bag.is_bag(file) or ros_bag.files_in(file)):
         return ros_bag
     head = b"" if file.is_dir() else _first_bytes(file)
     for importer in IMPORTERS:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.packets import decompress_quaternion
 
 Table = Mapping[Any, NDArray]  # columns, (N,) each, by the format's keys; "t" holds times, s
 Columns = Mapping[str, tuple[Any, float]]  # channel: the key of its column, and the factor to SI units
@@ -22,6 +23,8 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 YAW_PITCH_ROLL = ("yaw", "pitch", "roll")  # about z, then the turned y, then the turned x
 ROTATION_VECTOR = ("rx", "ry", "rz")
 EULER_XYZ = ("ex", "ey", "ez")  # about x, then the turned y, then the turned z
+MATRIX = ("xx", "yx", "zx", "xy", "yy", "zy", "xz", "yz", "zz")  # by columns: the body's x axis in the room first
+COMPRESSED = ("quat",)  # as in the firmware's packets: 2 bits for the largest component, 3 × 10 for the others
 POSE: Columns = {channel: (channel, 1.0) for channel in (*PLACE, *QUATERNION)}  # for tables that use these names
 
 _LISTED = 12  # most names that an error lists
@@ -97,6 +100,13 @@ def attitude(channels: Table) -> NDArray:
     return np.full((len(next(iter(channels.values()))), 4), np.nan)
 
 
+def without_zeros(table: Table, columns: Columns) -> Table:
+    """Return the columns with NaN in each row whose position is unknown, or which holds zeros alone: not seen."""
+    values = np.stack([table[key] for key, _ in columns.values()])  # the position first
+    values[:, np.isnan(values[:3]).any(axis=0) | (values == 0).all(axis=0)] = np.nan
+    return {"t": table["t"], **dict(zip((key for key, _ in columns.values()), values, strict=True))}
+
+
 def quaternions(values: NDArray, rotation: Callable[[NDArray], Rotation]) -> NDArray:
     """Return the rotation of each row as a quaternion, (N, 4), NaN where one of its values is not finite."""
     quaternion = np.full((len(values), 4), np.nan)
@@ -113,11 +123,25 @@ def _unit_quaternions(quaternion: NDArray) -> NDArray:
         return quaternion / np.where((length > 0) & (length < np.inf), length, np.nan)
 
 
+def _from_matrices(values: NDArray) -> NDArray:
+    """Return rotation matrices, (N, 9) by columns, as quaternions, (N, 4), NaN where one is no rotation."""
+    matrices = values.reshape(-1, 3, 3).transpose(0, 2, 1)
+    with np.errstate(all="ignore"):
+        rotations = np.where((np.linalg.det(matrices) > 0)[:, None], values, np.nan)
+    return quaternions(rotations, lambda known: Rotation.from_matrix(known.reshape(-1, 3, 3).transpose(0, 2, 1)))
+
+
+def _from_compressed(values: NDArray) -> Rotation:
+    return Rotation.from_quat(decompress_quaternion(values[:, 0]))
+
+
 _ATTITUDES: dict[tuple[str, ...], Callable[[NDArray], NDArray]] = {  # the first whose channels are present is used
     QUATERNION: _unit_quaternions,
     YAW_PITCH_ROLL: partial(quaternions, rotation=partial(Rotation.from_euler, "ZYX")),
     ROTATION_VECTOR: partial(quaternions, rotation=Rotation.from_rotvec),
     EULER_XYZ: partial(quaternions, rotation=partial(Rotation.from_euler, "XYZ")),
+    MATRIX: _from_matrices,
+    COMPRESSED: partial(quaternions, rotation=_from_compressed),
 }
 
 

@@ -38,6 +38,7 @@ _PACKET = re.compile(  # length, flags and kind of version 2; length and kind of
 _STAMP = 8  # bytes before each packet
 _SIGNED = 0x01  # of a v2 packet's incompatibility flags: 13 bytes of signature follow
 _LOCAL_FRD = 20
+_GLOBAL_POSITION = 33  # not read, but named where nothing else is there
 _LOCAL_POSITION, _ATTITUDE, _ATTITUDE_QUATERNION, _ODOMETRY, _SETPOINT = 32, 30, 31, 331, 85
 _MESSAGES: dict[int, tuple[tuple[str, ...], Callable[[Any], Any]]] = {  # message: channels, and their fields
     _LOCAL_POSITION: (PLACE, attrgetter("x", "y", "z")),
@@ -88,12 +89,13 @@ def read(file: Path) -> MocapLog:
 
 def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], bool]:
     """Return (time in s, bytes) of each packet of a kind that is read, and whether the last packet is cut off."""
-    packets, skipped, place = [], 0, 0
+    packets, skipped, place, kinds = [], 0, 0, set()
     while head := _PACKET.search(data, place):
         skipped += head.start() - place
         size = 12 + head["size"][0] + 13 * (head["flags"][0] & _SIGNED) if head["size"] else 8 + head["size_1"][0]
         place = head.start() + _STAMP + size
         kind = int.from_bytes(head["kind"] or head["kind_1"], "little")
+        kinds.add(kind)
         if kind in _MESSAGES and place <= len(data):
             time = int.from_bytes(head[0][:_STAMP], "big") * 1e-6
             packets.append((time, data[head.start() + _STAMP : place]))
@@ -101,6 +103,9 @@ def _packets(data: bytes, notes: list[str]) -> tuple[list[tuple[float, bytes]], 
     skipped += 0 if cut else len(data) - place
     if skipped:
         notes.append(f"{skipped} bytes skipped that are not packets")
+    if not kinds & set(_SUBJECTS):
+        where = "global positions only" if _GLOBAL_POSITION in kinds else "no positions"
+        notes.append(f"the log has {where}; LOCAL_POSITION_NED and ODOMETRY are read: have the vehicle send these")
     return packets, cut
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.recording.importers.csv_numbers import line_at, read_numbers
-from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, Table, in_order, subject
+from cfplan.recording.importers.csv_numbers import decimal_point, line_at, read_numbers
+from cfplan.recording.importers.mocap_log import LoggedSubject, MocapLog, Table, in_order, subject, without_zeros
 from cfplan.recording.importers.vicon_header import Group, Rotations, Section, read_head
 
 FORMAT = "Vicon CSV"
@@ -77,17 +77,13 @@ def _frames(data: bytes, begin: int, end: int, section: Section, where: str) -> 
     columns = [*section.frame_columns, *poses]
     first_line = data[begin : data.find(b"\n", begin, end) + 1 or end]
     width = max(first_line.count(section.delimiter.encode()), *columns) + 1
-    commas = section.delimiter == ";" and data.count(b",", begin, end) > data.count(b".", begin, end)
-    point = "," if commas else "."
+    point = decimal_point(data, begin, end, section.delimiter)
     return read_numbers(data, begin, end, columns, width, where, delimiter=section.delimiter, point=point)
 
 
 def _subject(group: Group, table: Table, where: str) -> LoggedSubject:
     """Return one subject's poses; a row of zeros is an occlusion, as some exports write it."""
-    values = np.stack([table[column] for column, _ in group.columns.values()])  # the position first
-    values[:, np.isnan(values[:3]).any(axis=0) | (values == 0).all(axis=0)] = np.nan
-    seen = dict(zip((column for column, _ in group.columns.values()), values, strict=True))
-    found = subject(group.name, {"t": table["t"], **seen}, group.columns, where=where)
+    found = subject(group.name, without_zeros(table, group.columns), group.columns, where=where)
     reach = np.nanmax(np.abs(found.position), initial=0.0)
     if reach > LARGEST_ROOM:
         raise InputError(

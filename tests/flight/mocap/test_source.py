@@ -15,6 +15,7 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 
+import motioncapture
 import pytest
 from hanging_server import hanging_server
 from stepped_vicon import SteppedFeed
@@ -22,9 +23,11 @@ from waiting import PATIENCE, a_moment, until
 
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.clock import SteppedClock
+from cfplan.flight.mocap.child import driver_of
 from cfplan.flight.mocap.pose_classifier import Verdict
+from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.source import OPEN_WITHIN, MocapSource, pose_source
-from cfplan.flight.mocap.uri import parse_uri
+from cfplan.flight.mocap.uri import SYSTEMS, parse_uri
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
@@ -216,7 +219,7 @@ def test_the_child_ends_with_its_parent():
     program = (
         "import os, sys\n"
         "from cfplan.flight.mocap.feed import Feed\n"
-        "from cfplan.flight.mocap.uri import parse_uri\n"
+        "from cfplan.flight.mocap.uri import SYSTEMS, parse_uri\n"
         "feed = Feed(parse_uri(sys.argv[1], subject_needed=True)); feed.start()\n"
         "while not feed.messages(): pass\n"
         "print(feed.child_id, flush=True)\n"
@@ -292,6 +295,31 @@ def test_a_missing_package_is_told_with_its_remedy(tmp_path, monkeypatch):
 def test_the_other_systems_say_so_where_nobody_is():
     with pytest.raises(LinkError, match="refused"):
         pose_source("qualisys://127.0.0.1:9/cf1", LIMITS).open()
+
+
+@pytest.mark.parametrize("system", ["optitrack", "optitrack-sdk", "qualisys", "vrpn", "nokov", "motionanalysis"])
+def test_every_client_gets_the_address_of_a_computer_that_is_named(monkeypatch, system):
+    got = {}
+    monkeypatch.setattr(motioncapture, "connect", lambda kind, settings: got.update(settings, kind=kind))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = f":{server.getsockname()[1]}" if SYSTEMS[system] else ""
+        SdkDriver(parse_uri(f"{system}://localhost{port}/cf1", subject_needed=True)).connect()
+    assert got["hostname"].split(":")[0] == "127.0.0.1"
+    assert got["kind"] == {"optitrack-sdk": "optitrack_closed_source"}.get(system, system)
+
+
+@pytest.mark.parametrize("system", sorted(SYSTEMS))
+def test_a_computer_that_nobody_knows_is_an_error_of_every_system(system):
+    uri = parse_uri(f"{system}://nowhere.invalid/cf1", subject_needed=True)
+    with pytest.raises(InputError, match=r"no computer named 'nowhere.invalid'"):
+        driver_of(uri).connect()
+
+
+@pytest.mark.parametrize("system", ["optitrack-sdk", "nokov", "motionanalysis"])
+def test_a_system_without_which_the_package_is_built_is_named(system):
+    with pytest.raises(InputError, match=f"built without {system}") as caught:
+        SdkDriver(parse_uri(f"{system}://127.0.0.1/cf1", subject_needed=True)).connect()
+    assert "from source" in caught.value.hint
 
 
 def test_a_source_goes_to_another_process():

@@ -16,6 +16,8 @@ from cfplan.flight.mocap.uri import SYSTEMS, MocapUri, no_such_body, parse_uri
         ("vicon-sdk://tracker/cf1", MocapUri("vicon-sdk", "tracker", 801, "cf1")),
         ("qualisys://10.0.0.7/my%20drone", MocapUri("qualisys", "10.0.0.7", 22222, "my drone")),
         ("optitrack://motive/cf1", MocapUri("optitrack", "motive", 1510, "cf1")),
+        ("optitrack-sdk://motive/cf1", MocapUri("optitrack-sdk", "motive", 1510, "cf1")),
+        ("nokov://seeker/cf1", MocapUri("nokov", "seeker", 0, "cf1")),
         ("vrpn://[fe80::1]:3884/cf1", MocapUri("vrpn", "fe80::1", 3884, "cf1")),
     ],
 )
@@ -24,7 +26,7 @@ def test_a_uri_names_system_computer_and_body(text, expected):
 
 
 def test_a_uri_survives_being_written_and_read():
-    for text in ("vicon://a/cf1", "vicon-sdk://a:9/cf1", "vrpn://[fe80::1]/x"):
+    for text in ("vicon://a/cf1", "vicon-sdk://a:9/cf1", "vrpn://[fe80::1]/x", "motionanalysis://a/cf1"):
         assert str(parse_uri(text, subject_needed=True)) == text
     assert parse_uri("vicon://a", subject_needed=False).subject == ""
 
@@ -38,6 +40,7 @@ def test_a_uri_survives_being_written_and_read():
         ("vikon://a/cf1", "vikon"),
         ("vicon://a:99999/cf1", "not the URI"),
         ("vicon://a:0/cf1", "port 0"),
+        ("nokov://a:80/cf1", "takes no port"),
         ("vicon://a/b/c", "one body"),
         ("vicon://a/cf1?rate=5", "not the URI"),
         ("vicon://me@a/cf1", "not the URI"),
@@ -57,7 +60,7 @@ def test_any_text_is_a_uri_or_an_input_error(text):
     except InputError:
         return
     assert uri.system in SYSTEMS
-    assert 0 < uri.port < 65536
+    assert 0 < uri.port < 65536 or uri.port == SYSTEMS[uri.system]
     assert uri.host
 
 

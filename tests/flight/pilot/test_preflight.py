@@ -216,6 +216,16 @@ def test_a_vehicle_near_the_wall_may_not_take_off(ground):
     assert failures(away) == ["place of take-off"]
 
 
+@pytest.mark.parametrize(
+    ("standing", "passes"), [((1.2, 0.02, -0.8), False), ((1.2, 0.02, 0.5), False), ((1.2, 0.4, 0.2), True)]
+)
+def test_a_vehicle_that_stands_far_above_or_beneath_the_floor_has_another_axis_up(ground, standing, passes):
+    stands = replace(
+        ground, poses=poses(place=standing), stood=standing, estimate=replace(ground.estimate, position=standing)
+    )
+    assert failures(stands) == ([] if passes else ["height of the body"])
+
+
 def test_a_plan_outside_the_space_is_refused(ground, mission):
     limits = mission.limits
     narrow = replace(limits, space=replace(limits.space, high=(1.0, 3.0, 2.0)))

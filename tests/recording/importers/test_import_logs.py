@@ -1,6 +1,7 @@
 """Logs of every format: written here by their layouts, read back equal; damaged ones are named or read in part."""
 
 import math
+import sqlite3
 import struct
 import sys
 import zlib
@@ -9,12 +10,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer as McapWriter
 from pymavlink.dialects.v20 import common
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.recording.importers.formats import read_log
 from tests.recording.importers import test_import_vicon as vicon
 
@@ -56,6 +59,19 @@ def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.
         log += b"\xff\xff" + stamp(start + time) + struct.pack(codes, *row)
         log += b"\0\0" + stamp(start) + b"\1\0" if other else b""
     return log + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
+
+
+def old_usd(variables, rows, *, block=8):
+    """The log of firmware before 2020: a header of text, and blocks of rows, each with a negated checksum."""
+
+    def checked(part):
+        return part + struct.pack("<I", ~zlib.crc32(part) & 0xFFFFFFFF)
+
+    codes = "<I" + "".join(variable[-2] for variable in variables)
+    packed = [struct.pack(codes, round(1000 * time) + 77, *row) for time, row in zip(TIMES, rows, strict=True)]
+    blocks = [packed[i : i + block] for i in range(0, COUNT, block)]
+    head = bytes([1 + len(variables)]) + ",".join(["tick(I)", *variables, ""]).encode()
+    return checked(head) + b"".join(checked(bytes([len(part)]) + b"".join(part)) for part in blocks)
 
 
 def estimate_rows(seed=0):
@@ -116,6 +132,7 @@ def pose(i, seed=0):
     return estimate_rows(seed)[0][i]
 
 
+LEVEL = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
 COVARIANCE = np.zeros(36)
 MESSAGES = {  # the first subject, and the fields of a message
     "geometry_msgs/msg/PoseStamped": ("/cf1/pose", lambda i: [*stamp(i), pose(i)]),
@@ -143,6 +160,7 @@ def bag_of_poses(folder, storage):
 
 TO_NED = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 TO_FRD = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
+GLOBAL = common.MAVLink_global_position_int_message(0, 500000000, 80000000, 1000, 1000, 0, 0, 0, 0)
 HEARTBEAT = common.MAVLink_heartbeat_message(2, 0, 0, 0, 4, 3)
 
 
@@ -186,6 +204,7 @@ def local(i, *, angles=False):
 ROWS = estimate_rows()[0]
 SOUND = {
     "microSD": usd(ESTIMATE, ROWS),
+    "old microSD": old_usd(ESTIMATE, ROWS),
     "crazyswarm": swarm().encode(),
     "odometry": tlog(lambda i: [odometry(i)]),
     "tlog": tlog(lambda i: [odometry(i), *local(i)]),
@@ -198,6 +217,7 @@ OF_ONE_FILE = [  # format, content, subjects
     ("Crazyflie microSD log", usd(ESTIMATE, ROWS, name="estTDOA"), ["estimate at estTDOA"]),
     ("Crazyflie microSD log", usd(ESTIMATE + MOCAP, np.hstack([estimate_rows(1)[0], ROWS])), ["mocap", "estimate"]),
     ("Crazyflie microSD log", usd(KALMAN, ROWS), ["kalman"]),
+    ("Crazyflie microSD log", SOUND["old microSD"], ["estimate"]),
     ("CSV of t, x, y, z", SOUND["crazyswarm"], ["log"]),
     ("CSV of t, x, y, z", swarm(("qx", "qy", "qz", "qw", "z", "y", "x", "timestamp")).encode(), ["log"]),
     ("MAVLink .tlog", SOUND["odometry"], ["vehicle 7 odometry"]),
@@ -242,6 +262,79 @@ def test_a_file_of_a_bag_may_stand_alone_under_its_suffix(tmp_path, storage):
         read_log(file.rename(tmp_path / "log"))
 
 
+@pytest.mark.parametrize("storage", SUFFIXES)
+def test_a_folder_without_metadata_is_read_by_its_files(tmp_path, storage):
+    place, _ = bag_of_poses(tmp_path, storage)
+    (place / "metadata.yaml").unlink()
+    assert_same(read_log(place).subjects[0])
+
+
+def test_a_bag_without_definitions_of_its_messages_as_humble_writes_holds_the_poses_of_crazyswarm2(tmp_path):
+    kind = NAMED_POSE + "Array"
+    place = bag(tmp_path / "bag", "/poses", kind, MESSAGES[kind][1])
+    (file,) = place.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("DROP TABLE message_definitions")
+        database.execute("UPDATE schema SET schema_version = 3")
+    database.close()
+    assert_same(read_log(place).subjects[0])
+
+
+def transforms(*frames):
+    """A message of transforms: (parent, child, pose (7,)) each."""
+    return lambda i: [
+        len(frames),
+        *(part for above, name, at in frames for part in (*stamp(i)[:2], above, name, at(i))),
+    ]
+
+
+def test_frames_of_transforms_are_composed_and_those_of_several_roots_are_told(tmp_path):
+    aside = np.array([0.1, 0.0, 0.0, *Rotation.from_euler("z", 90, degrees=True).as_quat()])
+    frames = [("world", "cf1", pose), ("cf1", "deck", lambda _: LEVEL), ("deck", "camera", lambda _: aside)]
+    other = ("/map", "gate", lambda _: LEVEL)
+    kind = "tf2_msgs/msg/TFMessage"
+    log = read_log(bag(tmp_path / "bag", "/tf", kind, transforms(*frames, other)))
+    cf1, deck, camera = log.select(["cf1", "deck", "camera"])
+    np.testing.assert_allclose(deck.position, cf1.position, atol=1e-9)
+    turned = Rotation.from_quat(cf1.quaternion)
+    np.testing.assert_allclose(camera.position, cf1.position + turned.apply(aside[:3]), atol=1e-9)
+    np.testing.assert_allclose(
+        Rotation.from_quat(camera.quaternion).apply([1, 0, 0]), turned.apply([0, 1, 0]), atol=1e-9
+    )
+    assert "the frames map, world" in log.notes[0]
+
+
+def test_a_static_transform_follows_its_moving_parent(tmp_path):
+    def message(i):
+        return transforms(("world", "cf1", pose), *([("cf1", "deck", lambda _: LEVEL)] if i == 0 else []))(i)
+
+    cf1, deck = read_log(bag(tmp_path / "bag", "/tf", "tf2_msgs/msg/TFMessage", message)).subjects
+    np.testing.assert_allclose(deck.time, cf1.time)
+    np.testing.assert_allclose(deck.position, cf1.position, atol=1e-9)
+
+
+def test_an_mcap_bag_that_is_cut_off_is_read_up_to_its_last_complete_chunk(tmp_path):
+    kind = "geometry_msgs/msg/PoseStamped"
+    file = tmp_path / "bag.mcap"
+    with file.open("wb") as stream:
+        writer = McapWriter(stream, chunk_size=1000)
+        writer.start(profile="ros2", library="")
+        schema = writer.register_schema(kind, "ros2msg", store().generate_msgdef(kind)[0].encode())
+        channel = writer.register_channel("/cf1/pose", "cdr", schema)
+        for i in range(COUNT):
+            writer.add_message(channel, round((START + TIMES[i]) * 1e9), cdr(*MESSAGES[kind][1](i)), 0)
+        writer.finish()
+    content = file.read_bytes()
+    assert_same(read_log(file).subjects[0])
+    file.write_bytes(content[: len(content) // 2])
+    log = read_log(file)
+    rows = len(log.subjects[0].time)
+    assert log.truncated
+    assert "cut off" in log.notes[0]
+    assert 5 < rows < COUNT
+    np.testing.assert_array_equal(log.subjects[0].position, poses()[0][:rows])
+
+
 def test_every_type_of_variable_is_read_at_its_place(tmp_path):
     names = ["a.b(B)", "a.c(b)", "stateEstimateZ.x(h)", "a.d(H)", "stateEstimateZ.y(h)", "a.e(I)", "a.f(e)",
              "stateEstimateZ.z(h)", "a.g(i)"]  # fmt: skip
@@ -249,6 +342,19 @@ def test_every_type_of_variable_is_read_at_its_place(tmp_path):
     rows = [(1, -1, x, 2, y, 3, 0.5, z, -4) for x, y, z in millimetres]
     log = read_log(written(tmp_path, usd(names, rows)))
     np.testing.assert_allclose(log.subjects[0].position, millimetres / 1000, atol=1e-9)
+
+
+def test_the_compressed_estimate_and_setpoint_are_millimetres_and_a_packed_quaternion(tmp_path):
+    _, position, rotations = estimate_rows()
+    millimetres = np.round(position * 1000).astype(int)
+    names = [f"{group}.{axis}(h)" for group in ("stateEstimateZ", "ctrltargetZ") for axis in "xyz"]
+    packed = compress_quaternion(rotations.as_quat())
+    rows = [(*place, *place, int(quat)) for place, quat in zip(millimetres, packed, strict=True)]
+    estimate, setpoint = read_log(written(tmp_path, usd([*names, "stateEstimateZ.quat(I)"], rows))).subjects
+    assert (estimate.name, setpoint.name) == ("estimate, compressed", "setpoint, compressed")
+    np.testing.assert_allclose([estimate.position, setpoint.position], [millimetres / 1000] * 2, atol=1e-9)
+    assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 0.005
+    assert np.isnan(setpoint.quaternion).all()
 
 
 def test_roll_pitch_and_yaw_are_those_of_the_firmware_whose_pitch_is_nose_up(tmp_path):
@@ -273,14 +379,15 @@ def test_a_csv_with_other_columns_too_and_without_attitudes_is_places_over_time(
 @pytest.mark.parametrize(
     ("name", "lost", "rows"),
     [
-        ("microSD", 4, 30), ("microSD", 5, 29), ("microSD", 20, 29), ("microSD", 60, 28), ("crazyswarm", 30, 29),
+        ("old microSD", 4, 30), ("old microSD", 5, 29), ("old microSD", 200, 24), ("microSD", 4, 30),
+        ("microSD", 5, 29), ("microSD", 20, 29), ("microSD", 60, 28), ("crazyswarm", 30, 29),
         ("odometry", 5, 29), ("odometry", 200, 29), ("Vicon", 12, 39),
     ],
 )  # fmt: skip
 def test_a_log_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, name, lost, rows):
     log = read_log(written(tmp_path, SOUND[name][:-lost]))
     assert log.truncated
-    assert ("checksum" if name == "microSD" else "cut off") in log.notes[-1]
+    assert ("checksum" if "microSD" in name else "cut off") in log.notes[-1]
     sound = read_log(written(tmp_path, SOUND[name])).subjects[0]
     assert len(log.subjects[0].time) == rows
     np.testing.assert_array_equal(log.subjects[0].position, sound.position[:rows])
@@ -306,17 +413,20 @@ def test_what_is_left_out_of_a_tlog_is_said(tmp_path, content, rows, note):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (usd(["gyro.x(f)"], [(0,)] * COUNT), "no position was logged; the variables are gyro.x, id"),
+        (usd(["gyro.x(f)"], [(0,)] * COUNT), "fixedFrequency has gyro.x; estTDOA has id"),
         (SOUND["microSD"].replace(b"x(f)", b"x(Q)"), "head of the log is damaged"),
         (b"\xbc\x07\x00\x01\x00", "version 7"),
+        (SOUND["old microSD"][:30], "damaged behind byte 0"),
+        (SOUND["old microSD"][:-9] + b"~" + SOUND["old microSD"][-8:], "damaged behind byte"),
         (SOUND["microSD"][:30], "head of the log is damaged or cut off"),
         (SOUND["microSD"][: -38 * COUNT - 4], "ends before its first record"),
         (SOUND["microSD"][:-10] + b"\x12" + SOUND["microSD"][-9:], "checksum is wrong"),
         (SOUND["crazyswarm"].replace(b",qz", b"", 1), ":1: .*no column qz"),
         (SOUND["crazyswarm"].replace(b"0.01", b"soon", 1), ":3: 'soon.*in column 1 is not a number"),
         (SOUND["crazyswarm"].replace(b"\n", b",1\n", 3), ":4: 8 cells, 9"),
-        (SOUND["crazyswarm"].split(b"\n")[0] + b"\n", "no pose"),
-        (tlog(lambda i: [HEARTBEAT]), "no pose"),
+        (SOUND["crazyswarm"].split(b"\n")[0] + b"\n", "no rows of numbers below the header"),
+        (tlog(lambda i: [HEARTBEAT]), "no pose .*no positions; LOCAL_POSITION_NED"),
+        (tlog(lambda i: [GLOBAL, HEARTBEAT]), "no pose .*global positions only; LOCAL_POSITION_NED and ODOMETRY"),
         (b"", "the file is empty"),
         *((content, "unknown format") for content in (b"a picture", b"\x00" * 100, b"Objects\n")),
     ],
@@ -399,7 +509,7 @@ def test_damage_anywhere_is_an_error_with_its_place_and_a_hint_or_a_log(tmp_path
         assert log.hint
         assert "\n" not in str(log)
         return
-    assert log.truncated or (name, kind) != ("microSD", "flipped bit")  # its checksum tells
+    assert log.truncated or kind != "flipped bit" or "microSD" not in name  # its checksum tells
     for subject in log.subjects:
         assert subject.position.shape == (len(subject.time), 3)
         assert np.all(np.diff(subject.time) > 0)
