@@ -65,8 +65,9 @@ def test_a_flow_deck_is_a_parameter_that_says_so():
 
 
 def test_no_vehicle_has_a_flow_deck_and_its_poses_by_radio_alone():
-    with pytest.raises(InputError, match="no flow deck"):
-        VirtualRoom(load_limits(SAFETY), 19850, 1, 8010, flow_deck=True).require_ports()
+    ended = CliRunner().invoke(virtual, ["--flow-deck", "--vicon", "8010", "--safety", str(SAFETY)])
+    assert isinstance(ended.exception, InputError)
+    assert "no flow deck" in str(ended.exception)
 
 
 def test_without_a_safety_yaml_the_vehicle_of_the_examples_is_served(tmp_path, monkeypatch):
