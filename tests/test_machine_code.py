@@ -115,7 +115,7 @@ def test_a_damaged_file_is_compiled_anew(cache):
     assert files(cache) == [name]
 
 
-KEYS = "from cfplan.machine_code import key; print(*(key(f'cfplan.{n}') for n in ('upper', 'lower', 'lowest', 'other')))"
+KEYS = "from cfplan.machine_code import *; print(*(key(f'cfplan.{n}') for n in ('upper', 'lower', 'lowest', 'other')))"
 
 
 def test_a_change_in_an_imported_module_changes_the_key(tmp_path):
