@@ -544,12 +544,12 @@ def compile_from_here() -> None:
 
 def is_compiled(call: Call) -> bool:
     """Return whether a call needs no compiling."""
-    return (cache_folder() / _file_of(call)).exists()
+    return file_of(call).exists()
 
 
 def compile_call(call: Call) -> bool:
     """Compile what a call needs, unless another process is compiling it: then return False."""
-    name = _file_of(call)
+    name = file_of(call).name
     if not _locks.take(name, wait=False):
         return False
     try:
@@ -559,9 +559,10 @@ def compile_call(call: Call) -> bool:
     return True
 
 
-def _file_of(call: Call) -> str:
+def file_of(call: Call) -> Path:
+    """Return the file in which the machine code of a call is kept, whether it is there or not."""
     function = getattr(importlib.import_module(call.module), call.function)
-    return function._cache.file_name(call.types)
+    return cache_folder() / function._cache.file_name(call.types)
 
 
 def claim(name: str) -> bool:

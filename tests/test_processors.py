@@ -18,6 +18,7 @@ import json, math
 import numpy as np
 from numpy._core._multiarray_umath import __cpu_dispatch__, __cpu_features__
 from cfplan import machine_code
+from numba.core.registry import cpu_target
 
 @machine_code.njit
 def doubled(x):
@@ -25,7 +26,7 @@ def doubled(x):
 
 assert doubled(21) == 42
 print(json.dumps({
-    "name": machine_code._processor()[0], "width": machine_code.vector_width(),
+    "name": cpu_target.target_context.codegen().magic_tuple()[1], "width": machine_code.vector_width(),
     "numpy": [name for name in __cpu_dispatch__ if __cpu_features__[name]],
     "compiled": doubled.stats.cache_misses != {},
 }))

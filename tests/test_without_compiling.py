@@ -6,39 +6,34 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from cfplan import machine_code
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
 
 ROOT = Path(__file__).parent.parent
+# Runs the loops that are else compiled, and what stands for them, on the same arguments.
 BOTH_WAYS = """
 import copy, json, sys
 import numpy as np
-from cfplan import machine_code
+from cfplan.machine_code import without_compiling
 
-with_another_way, called = set(), set()
+called = set()
 
-class Both(machine_code._Interpreted):
-    # Runs the loops that are else compiled, and what stands for them, on the same arguments.
-    def __init__(self, function, interpreted, options):
-        super().__init__(function, interpreted, options)
-        if interpreted is not function:
-            with_another_way.add(self.name)
+def both_ways(stand_in):
+    name = f"{stand_in.function.__module__}.{stand_in.function.__qualname__}"
 
-    @property
-    def name(self):
-        return f"{self.function.__module__}.{self.function.__qualname__}"
-
-    def __call__(self, *arguments):
-        if self.interpreted is self.function:
-            return self.function(*arguments)
-        called.add(self.name)
+    def run(*arguments):
+        called.add(name)
         for_loops = copy.deepcopy(arguments)
-        by_loops, by_arrays = self.function(*for_loops), self.interpreted(*arguments)
-        compare(self.name, (by_loops, for_loops), (by_arrays, arguments))
+        by_loops, by_arrays = stand_in.function(*for_loops), stand_in.interpreted(*arguments)
+        compare(name, (by_loops, for_loops), (by_arrays, arguments))
         return by_arrays
+
+    return name, run
 
 def compare(name, expected, found):
     if isinstance(expected, tuple):
@@ -52,19 +47,52 @@ def compare(name, expected, found):
     else:
         assert expected is found or expected == found, name
 
-machine_code._Interpreted = Both
-with machine_code.without_compiling():
+with without_compiling():
     from pathlib import Path
+    import cfplan.learning.learned, cfplan.planners.expert.expert, cfplan.planning.repair
+    from cfplan.flight.setpoints.packets import FullStateSetpoints
+    from cfplan.flight.setpoints.stops import stop_motion
     from cfplan.geometry.min_snap import min_snap
     from cfplan.geometry.yaw import YawMode
     from cfplan.planning.plan import plan
     from cfplan.safety.limits_file import load_limits
+
+    with_another_way = {}
+    for module in [each for name, each in sys.modules.items() if name.startswith("cfplan.")]:
+        for name, value in list(vars(module).items()):
+            if hasattr(value, "interpreted") and value.interpreted is not value.function:
+                if value not in with_another_way:
+                    with_another_way[value] = both_ways(value)
+                setattr(module, name, with_another_way[value][1])
     limits = load_limits(Path("safety.yaml"))
     path = min_snap([[0.0, 0.0, 1.0], [0.6, 0.5, 1.2], [0.0, 0.9, 0.8]])
     path.check()
-    plan(path, limits.airframe, limits, planner="learned")
+    made = plan(path, limits.airframe, limits, planner="learned")
     plan(path, limits.airframe, limits, planner="expert", nodes=12, yaw=YawMode.FREE)
-print(json.dumps([sorted(with_another_way), sorted(called)]))
+    for rows in (1, 2, 40):
+        state = made.trajectory.at(np.arange(rows) / 100.0)
+        motion = FullStateSetpoints(*(getattr(state, name) for name in FullStateSetpoints.__slots__))
+        stop_motion(motion, np.arange(rows), 100.0)
+print(json.dumps([sorted(name for name, _ in with_another_way.values()), sorted(called)]))
+"""
+# No error, though compiled code takes in its stride what is one in Python: a motion at rest, or turned fast.
+TRADES = """
+import json, sys
+import numpy as np
+from cfplan.machine_code import without_compiling
+
+def traded(quaternion, rate):
+    from cfplan.flight.setpoints.packets import FullStateSetpoints
+    from cfplan.flight.setpoints.rate_trade import harmless_rates, trade_rates
+    none = np.zeros((2, 3))
+    motion = FullStateSetpoints(none, none, none, np.array([quaternion] * 2), np.full((2, 3), rate))
+    sent, harmless = trade_rates(motion, none), harmless_rates(motion, none)
+    return [getattr(sent, name).tolist() for name in FullStateSetpoints.__slots__], harmless.tolist()
+
+cases = [(q, rate) for q in ([0.0, 0.0, 0.0, 1.0], [0.0, 0.5**0.5, 0.0, 0.5**0.5]) for rate in (0.0, 30.0)]
+with without_compiling():
+    interpreted = [traded(*case) for case in cases]
+print(json.dumps([interpreted, [traded(*case) for case in cases]]))
 """
 PLANS = """
 import json, sys
@@ -103,6 +131,16 @@ def test_numpy_computes_what_the_loops_do(tmp_path):
     ((with_another_way, called),) = run(BOTH_WAYS, tmp_path)
     assert called == with_another_way
     assert len(called) > 8
+    assert any("setpoints.stops" in name for name in called)
+
+
+def test_rates_are_traded_without_machine_code_as_with_it():
+    """A new computer flies so while it compiles."""
+    ((interpreted, compiled),) = run(TRADES, machine_code.cache_folder())
+    for (sent, harmless), (sent_compiled, harmless_compiled) in zip(interpreted, compiled, strict=True):
+        for found, expected in zip(sent, sent_compiled, strict=True):
+            np.testing.assert_allclose(found, expected, atol=1e-12)
+        np.testing.assert_allclose(harmless, harmless_compiled, atol=1e-12)
 
 
 @pytest.mark.integration

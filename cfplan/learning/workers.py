@@ -22,7 +22,9 @@ class SchedulerError(CfplanError):
 
 
 @contextmanager
-def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
+def pool(
+    workers: int = 1, scheduler: str | None = None, *, worker_patience: float = WORKER_PATIENCE
+) -> Iterator[Work[Any]]:
     """Yield a function that calls another on each item, and yields what that returns as it is done, in any order.
 
     One worker without a scheduler works in this process. A worker of a cluster that dies costs only the items that it
@@ -30,7 +32,7 @@ def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
 
     Raises:
         SchedulerError: Dask is not installed, the scheduler does not answer within SCHEDULER_PATIENCE, no worker comes
-            within WORKER_PATIENCE, or one works at several items at a time.
+            within `worker_patience`, s, or one works at several items at a time.
     """
     from joblib import Parallel, delayed, parallel_config
 
@@ -46,12 +48,12 @@ def pool(workers: int = 1, scheduler: str | None = None) -> Iterator[Work[Any]]:
             yield run
         return
     n_jobs = -1
-    with _client(scheduler) as client, parallel_config(backend="dask", client=client):
+    with _client(scheduler, worker_patience) as client, parallel_config(backend="dask", client=client):
         yield run
 
 
 @contextmanager
-def _client(scheduler: str) -> Iterator[object]:
+def _client(scheduler: str, worker_patience: float) -> Iterator[object]:
     try:
         from distributed import Client
     except ImportError:
@@ -66,20 +68,20 @@ def _client(scheduler: str) -> Iterator[object]:
             f"no Dask scheduler answers there ({error})", where=scheduler, hint="start one with `dask scheduler`"
         ) from None
     try:
-        _require_workers(client, scheduler)
+        _require_workers(client, scheduler, worker_patience)
         yield client
     finally:
         client.close()
 
 
-def _require_workers(client: Any, scheduler: str) -> None:
+def _require_workers(client: Any, scheduler: str, patience: float) -> None:
     """Check that somebody works there, and one item at a time: what is measured of an item is its process's time."""
     command = f"`dask worker --nworkers -1 --nthreads 1 {scheduler}`"
     try:
-        client.wait_for_workers(1, timeout=WORKER_PATIENCE)
+        client.wait_for_workers(1, timeout=patience)
     except TimeoutError:
         raise SchedulerError(
-            f"the scheduler has no worker, after {WORKER_PATIENCE:g} s",
+            f"the scheduler has no worker, after {patience:g} s",
             where=scheduler,
             hint=f"start one for each processor: {command}",
         ) from None

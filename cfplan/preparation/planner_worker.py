@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection, wait
 import numpy as np
 
 from cfplan.errors import CfplanError
-from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.pilot.proposals import LOOKS_UNTIL, PilotAnswer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault
 from cfplan.flight.setpoints.encoding import RATE
@@ -72,10 +72,12 @@ _LOOK_AGAIN = 0.05  # s, until the planner sees whether more of a plan is to be 
 class PlannerWorker:
     """The planner in its own process."""
 
-    def __init__(self, held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection):
-        self._limits = limits
-        self._requests = RequestQueue(requests)
-        self._chain = ProposalChain(held, self._requests, pilot, self._note_accepted)
+    def __init__(
+        self, held: HeldFlight, limits: Limits, requests: Connection, pilot: Connection, clock: Clock = REAL_CLOCK
+    ):
+        self._limits, self._clock = limits, clock
+        self._requests = RequestQueue(requests, clock)
+        self._chain = ProposalChain(held, self._requests, pilot, self._note_accepted, clock)
         self._inputs = [requests, pilot]
         self._plans, self._stops, self._parts = Lead(FIRST_TIME), Lead(FIRST_STOP), Lead(FIRST_STOP)
         self._meanwhile = Lead(FIRST_TIME)  # of plans that are simulated while the next one is planned
@@ -107,7 +109,7 @@ class PlannerWorker:
         """Make two plans and stops for nobody: what a first call compiles or loads is there before the flight."""
         held = self._chain.held
         for _ in range(2):
-            begun = REAL_CLOCK.now()
+            begun = self._clock.now()
             with contextlib.suppress(CfplanError):
                 places = [held.flown.at(held.ends / 2).position, *map(np.array, self._middle)]
                 away = max(places, key=lambda place: float(np.linalg.norm(place - held.ahead[-1])))
@@ -115,10 +117,10 @@ class PlannerWorker:
                 meanwhile = AnswerAttempt(lambda splice, equal: False, Ways(), foresee=False, meanwhile=True)
                 waits = replan(held, first, [away, held.ahead[-1]], self._limits, part=part, attempt=meanwhile)
                 assert len(waits.held.snapshots)
-                self._meanwhile.note(2.0 * (REAL_CLOCK.now() - begun), only=True)
-                begun = REAL_CLOCK.now()
+                self._meanwhile.note(2.0 * (self._clock.now() - begun), only=True)
+                begun = self._clock.now()
                 made = replan(held, first, [away, held.ahead[-1]], self._limits, part=part)
-                self._plans.note(REAL_CLOCK.now() - begun, only=True)
+                self._plans.note(self._clock.now() - begun, only=True)
                 go_on(made.held, made.proposal.splice + part // 2, self._limits, part)
                 halt(made.held, made.proposal.splice + part // 2, self._limits)
 
@@ -156,11 +158,11 @@ class PlannerWorker:
         self._pressed = came < max(self._done, chain.settled_at)
         answer, chain.fell_back = self._answer(request, came), False
         chain.read()  # what has come by now has waited
-        self._done = REAL_CLOCK.now()
-        return None if answer is None else replace(answer, seconds=REAL_CLOCK.now() - came)
+        self._done = self._clock.now()
+        return None if answer is None else replace(answer, seconds=self._clock.now() - came)
 
     def _wants_more(self) -> bool:
-        held, quiet = self._chain.held, REAL_CLOCK.now() - self._requests.asked
+        held, quiet = self._chain.held, self._clock.now() - self._requests.asked
         if not held.unfinished:
             return False
         if self._pressed and quiet < HASTE:
@@ -174,7 +176,7 @@ class PlannerWorker:
 
     def _in_time_for(self, ahead: float) -> int:
         """Return the setpoint from which on one may plan who needs so long, s."""
-        arrives = REAL_CLOCK.now() - self._chain.begun + ahead
+        arrives = self._clock.now() - self._chain.begun + ahead
         return max(math.ceil((arrives + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD, self._chain.held.begin)
 
     def _answer(self, request: PathRequest, received: float) -> PathAnswer | None:
@@ -190,7 +192,7 @@ class PlannerWorker:
         ways, bad = Ways(), set[Manner]()
         chain, reason, took, solved, checked = self._chain, "", 0.0, 0.0, 0.0
         for tried in range(TRIES):
-            begun = self._made = REAL_CLOCK.now()
+            begun = self._made = self._clock.now()
             held = chain.held
             meanwhile = self._pressed and not chain.fell_back
             lead = self._stops if request.wish is Wish.STOP else self._meanwhile if meanwhile else self._plans
@@ -209,8 +211,8 @@ class PlannerWorker:
             try:
                 made = self._planned(request, first, part_within(ahead), attempt)
             except TooLateError as error:
-                solved = REAL_CLOCK.now() - begun - ways.searched
-                took = REAL_CLOCK.now() - begun + self._to_do
+                solved = self._clock.now() - begun - ways.searched
+                took = self._clock.now() - begun + self._to_do
                 lead.note(took, self._left_out)
                 if len(bad) > badly:  # it was not for want of a way
                     took = 0.0
@@ -228,7 +230,7 @@ class PlannerWorker:
                 continue
             if made is None or chain.stuck:
                 return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER if chain.stuck else reason)
-            done = REAL_CLOCK.now()
+            done = self._clock.now()
             took = done - begun
             if isinstance(made, HeldFlight):
                 chain.held = made
@@ -259,7 +261,7 @@ class PlannerWorker:
             lead.note(max(answer.came, done) - begun, made.equal / RATE)
             reason = answer.reason
             if not reason.startswith(Fault.LATE):
-                return proposed.answer(answer)
+                return proposed.answer(answer, self._clock.now())
         return PathAnswer(request.number, PathVerdict.LATE, reason)
 
     def _another_waits(self) -> bool:
@@ -279,20 +281,20 @@ class PlannerWorker:
             self._to_do += self._planning
             self._left_out = float(np.median(of_kind)) / RATE
         else:
-            self._made = REAL_CLOCK.now()
+            self._made = self._clock.now()
             of_kind.append(equal)
             self._left_out = equal / RATE
         return self._late_by(splice) + self._to_do > self._left_out
 
     def _in_time(self, checking: float) -> int:
         """Return the number of the first setpoint in time for a plan that is made, as `checking`, s, comes first."""
-        self._made = REAL_CLOCK.now()
+        self._made = self._clock.now()
         return self._in_time_for(AGAIN * checking + SLACK)
 
     def _late_by(self, splice: int) -> float:
         """Return how much too late, s, what is sent now comes to the pilot, where it begins at a setpoint."""
         looks_until = self._chain.begun + (splice - LEAST_AHEAD + 1) / RATE - LOOKS_UNTIL
-        return REAL_CLOCK.now() + ON_THE_WAY - looks_until
+        return self._clock.now() + ON_THE_WAY - looks_until
 
     @property
     def _planning(self) -> float:
@@ -311,12 +313,12 @@ class PlannerWorker:
 
     def _go_on(self) -> PathAnswer | None:
         """Propose the next part of the plan that is flown; return what there is to tell."""
-        begun, (first, ahead) = REAL_CLOCK.now(), self._next(self._parts)
+        begun, (first, ahead) = self._clock.now(), self._next(self._parts)
         try:
             made = plan_next_part(self._chain.held, first, self._limits, part_within(ahead, NEXT_PART))
         except Exception as error:  # as in _answer
             return self._interrupt(told_of(error))
-        self._parts.note(REAL_CLOCK.now() - begun)
+        self._parts.note(self._clock.now() - begun)
         if isinstance(made, HeldFlight):
             self._chain.held = made
             return None
@@ -368,7 +370,7 @@ class PlannerWorker:
             if self._requests.waiting is None:
                 return None
             request, came = self._requests.take()
-            return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER, seconds=REAL_CLOCK.now() - came)
+            return PathAnswer(request.number, PathVerdict.REFUSED, NO_ANSWER, seconds=self._clock.now() - came)
         if proposed.request is None:
             return self._gone_on(proposed.made, answer)
         if answer.commitment is None:

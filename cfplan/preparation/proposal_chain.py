@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 
 from cfplan.errors import CfplanError
-from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.clock import Clock
 from cfplan.flight.pilot.proposals import PilotAnswer, read_answer
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault, spliced
 from cfplan.flight.setpoints.encoding import RATE
@@ -39,15 +39,15 @@ class Proposed:
     lead: Lead | None = None  # which learns how long it took
     before: HeldFlight | None = None  # what is held where it does not pass; None where its answer is waited for
 
-    def answer(self, answer: PilotAnswer) -> PathAnswer:
-        """Return the answer to the request by the pilot's to the proposal."""
+    def answer(self, answer: PilotAnswer, now: float) -> PathAnswer:
+        """Return the answer to the request by the pilot's to the proposal, which has come now, s."""
         request, made = self.request, self.made
         assert request is not None
         if answer.commitment is None:
             late = answer.reason.startswith(Fault.LATE)
             return PathAnswer(request.number, PathVerdict.LATE if late else PathVerdict.REFUSED, answer.reason)
         seconds = 0.0 if made.plan is None else made.plan.seconds
-        times = AnswerTimes(self.received, self.begun, seconds, self.sent, REAL_CLOCK.now())
+        times = AnswerTimes(self.received, self.begun, seconds, self.sent, now)
         stop = 0 if made.stop is None else made.stop.proposal.checksum
         return replace(answer_accepted(request.number, made, stop), times=times)
 
@@ -62,7 +62,12 @@ class ProposalChain:
     """What is held, and the proposals that lead to it."""
 
     def __init__(
-        self, held: HeldFlight, requests: RequestQueue, pilot: Connection, on_accepted: Callable[[Proposed], None]
+        self,
+        held: HeldFlight,
+        requests: RequestQueue,
+        pilot: Connection,
+        on_accepted: Callable[[Proposed], None],
+        clock: Clock,
     ):
         """Hold a flight; `on_accepted` hears of each proposal that the pilot accepts."""
         self.held, self.begun = held, math.nan  # s, when setpoint 0 was due, once that is known
@@ -71,6 +76,7 @@ class ProposalChain:
         self.settled_at = -math.inf  # s, when the pilot last answered one that nobody waited for
         self._held_back: Proposed | None = None
         self._requests, self._pilot, self._on_accepted = requests, pilot, on_accepted
+        self._clock = clock
 
     @property
     def settled(self) -> bool:
@@ -89,8 +95,8 @@ class ProposalChain:
         heard of.
         """
         found = None
-        until = REAL_CLOCK.now() + patience
-        while ready := wait([self._requests.connection, self._pilot], max(until - REAL_CLOCK.now(), 0.0)):
+        until = self._clock.now() + patience
+        while ready := wait([self._requests.connection, self._pilot], max(until - self._clock.now(), 0.0)):
             if self._pilot in ready:
                 answer = read_answer(self._pilot.recv_bytes())
                 if answer.begun is not None:
@@ -140,7 +146,7 @@ class ProposalChain:
             self._wait_for_foreseen()
         if self._held_back is None:  # it fell with what it was planned on
             return
-        released, self._held_back = replace(self._held_back, sent=REAL_CLOCK.now()), None
+        released, self._held_back = replace(self._held_back, sent=self._clock.now()), None
         if fault is not None:
             self._fall_back(released, PathVerdict.SUPERSEDED, told_of(fault))
             return
@@ -181,14 +187,14 @@ class ProposalChain:
         """Take the pilot's answer to a proposal."""
         self.proposed = None
         if proposed.before is not None:  # nobody waits for it
-            self.settled_at = REAL_CLOCK.now()
+            self.settled_at = self._clock.now()
             assert proposed.lead is not None
             proposed.lead.note(max(answer.came, proposed.sent) - proposed.begun, proposed.made.equal / RATE)
-            told = proposed.answer(answer)
+            told = proposed.answer(answer, self.settled_at)
             if answer.commitment is None:
                 self._fall_back(proposed, told.verdict, told.reason)
             else:
-                self._requests.tell(replace(told, seconds=REAL_CLOCK.now() - proposed.received))
+                self._requests.tell(replace(told, seconds=self._clock.now() - proposed.received))
         elif answer.commitment is not None:
             self.held = self._committed_to(proposed.made)
         held = self.held if self._held_back is None else self._held_back.before
@@ -208,11 +214,11 @@ class ProposalChain:
         for each, told, why in ((fallen, verdict, reason), (dropped, PathVerdict.SUPERSEDED, "")):
             if each is None or each.request is None or self._requests.wait_again(each.request, each.received):
                 continue
-            self._requests.tell(PathAnswer(each.request.number, told, why, seconds=REAL_CLOCK.now() - each.received))
+            self._requests.tell(PathAnswer(each.request.number, told, why, seconds=self._clock.now() - each.received))
 
     def _committed_to(self, made: Replanned) -> HeldFlight:
         """Return what is held once the pilot has accepted a proposal."""
-        due = math.floor((REAL_CLOCK.now() - self.begun) * RATE)  # the pilot looked a little earlier
+        due = math.floor((self._clock.now() - self.begun) * RATE)  # the pilot looked a little earlier
         now = min(due, made.proposal.splice - LEAST_AHEAD)
         return accepted(made, spliced(self.held.commitment, made.proposal, now))
 

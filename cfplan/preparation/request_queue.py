@@ -3,15 +3,15 @@
 import math
 from multiprocessing.connection import Connection
 
-from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.clock import Clock
 from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict
 
 
 class RequestQueue:
     """The requests of the main process, of which only the latest waits, and the answers to them."""
 
-    def __init__(self, connection: Connection):
-        self.connection = connection
+    def __init__(self, connection: Connection, clock: Clock):
+        self.connection, self._clock = connection, clock
         self.waiting: tuple[PathRequest, float] | None = None  # and when it came, s
         self.asked = -math.inf  # s, when the last request came
         self._newest = 0  # number of that
@@ -21,7 +21,7 @@ class RequestQueue:
         request = self.connection.recv()
         if self.waiting is not None:
             self.tell(PathAnswer(self.waiting[0].number, PathVerdict.SUPERSEDED))
-        self.asked, self._newest = REAL_CLOCK.now(), request.number
+        self.asked, self._newest = self._clock.now(), request.number
         self.waiting = request, self.asked
 
     def take(self) -> tuple[PathRequest, float]:

@@ -27,14 +27,14 @@ def shown(capsys, monkeypatch):
         else:
             monkeypatch.delenv("FORCE_COLOR", raising=False)
         clock, texts = SteppedClock(), {}
-        with FlightProgress(duration=4.0, steps=Steps(as_json=False), clock=clock) as progress:
-            for phase in Phase:
+        for phase in Phase:
+            with FlightProgress(duration=4.0, steps=Steps(as_json=False), clock=clock) as progress:
                 progress.show(PhaseEntered(clock.now(), phase))
                 clock.sleep(1.0)
                 pose = PoseReceived(clock.now(), clock.now(), (-0.001, 1.0, 0.5), (0.0, 0.0, 0.0, 1.0))
                 progress.show(pose)
-                progress._bar.refresh()
-                texts[phase] = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
+            # at its end the bar is drawn once more
+            texts[phase] = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", capsys.readouterr().err)
         return texts
 
     return show

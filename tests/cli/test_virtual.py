@@ -1,6 +1,5 @@
 """`cfplan virtual` says in words that its supervisor has locked, wherever its output goes, and who stands where."""
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,15 +65,13 @@ def test_a_flow_deck_is_a_parameter_that_says_so():
 
 
 def test_no_vehicle_has_a_flow_deck_and_its_poses_by_radio_alone():
-    with pytest.raises(InputError, match="no flow deck"):
-        VirtualRoom(load_limits(SAFETY), 19850, 1, 8010, flow_deck=True).require_ports()
+    ended = CliRunner().invoke(virtual, ["--flow-deck", "--vicon", "8010", "--safety", str(SAFETY)])
+    assert isinstance(ended.exception, InputError)
+    assert "no flow deck" in str(ended.exception)
 
 
 def test_without_a_safety_yaml_the_vehicle_of_the_examples_is_served(tmp_path, monkeypatch):
-    served = []
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys.modules["cfplan.cli.virtual"], "_serve", lambda room, *_: served.append(room))
-    ended = CliRunner().invoke(virtual, ["--flow-deck"])
+    ended = CliRunner().invoke(virtual, ["--port", "19958", "--seconds", "0.1"])
     assert ended.exit_code == 0, ended.output
-    assert served[0].limits.vehicle == load_limits(SAFETY).vehicle
-    assert served[0].flow_deck
+    assert f"{load_limits(SAFETY).vehicle} cf1: --uri udp://127.0.0.1:19958" in ended.output

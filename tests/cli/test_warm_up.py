@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import psutil
 import pytest
 from waiting import until
 
@@ -61,28 +62,41 @@ def test_what_a_first_plan_needed_is_compiled_behind_it(tmp_path):
     assert "without machine code" not in done.stdout
 
 
-GOING_ON = """
-import os
-from cfplan import machine_code
-from cfplan.cli import warm_up
-print(warm_up._may_go_on(os.getppid()), warm_up._may_go_on(-1), os.nice(0) == warm_up.LEAST_PRIORITY, flush=True)
-warm_up._step_back_once_alone()
-print(os.nice(0) == warm_up.LEAST_PRIORITY)
+# A command that begins two processes, says which, and ends once it may.
+COMMAND = """
+import sys
+from pathlib import Path
+from cfplan.cli.warm_up import Worker
+from cfplan.preparation.compiled_calls import Stage
+workers = [Worker(Stage.PLAN, Path("safety.yaml"), first) for first in ("0.5", "0.7")]
+print(*(each.process.pid for each in workers), flush=True)
+sys.stdin.readline()
 """
 
 
-def test_of_those_whose_command_has_ended_one_goes_on(tmp_path):
-    def begin():
-        return subprocess.Popen(
-            [sys.executable, "-c", "import sys\n" + GOING_ON], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            env=os.environ | {"CFPLAN_CACHE": str(tmp_path)},
-        )  # fmt: skip
+@pytest.mark.integration
+def test_of_those_whose_command_has_ended_one_goes_on_at_the_lowest_priority(tmp_path):
+    command = subprocess.Popen(
+        [sys.executable, "-c", COMMAND], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+        env=os.environ | {"CFPLAN_CACHE": str(tmp_path)},
+    )  # fmt: skip
+    workers = [psutil.Process(int(each)) for each in command.stdout.readline().split()]
 
-    first = begin()
-    assert first.stdout.readline() == "True True False\n"
-    assert begin().communicate("\n", timeout=60)[0] == "True False False\nTrue\n"
-    assert first.communicate("\n", timeout=60)[0] == "True\n"
-    assert begin().communicate("\n", timeout=60)[0] == "True True False\nTrue\n"
+    def alive():
+        return [each for each in workers if each.is_running() and each.status() != psutil.STATUS_ZOMBIE]
+
+    try:
+        assert until(lambda: list(tmp_path.glob("*.numba")))  # they compile
+        assert len(alive()) == 2
+        assert command.communicate("\n", timeout=60)[0] == ""
+        assert until(lambda: len(alive()) < 2)
+        compiled = len(list(tmp_path.glob("*.numba")))
+        assert until(lambda: len(list(tmp_path.glob("*.numba"))) > compiled + 1)
+        (alone,) = alive()
+        assert alone.nice() == warm_up.LEAST_PRIORITY
+    finally:
+        for each in alive():
+            each.kill()
 
 
 WORK = "from cfplan.cli.warm_up import *; work(Stage.PLAN, Path('safety.yaml'), 'last')"
@@ -95,7 +109,7 @@ from pathlib import Path
 for call in find_calls(Path("safety.yaml"), Stage.PLAN):
     while not machine_code.is_compiled(call):
         machine_code.compile_call(call)
-    shutil.copy(machine_code.cache_folder() / machine_code._file_of(call), sys.argv[1])
+    shutil.copy(machine_code.file_of(call), sys.argv[1])
 """
 
 
@@ -110,6 +124,8 @@ def test_what_is_compiled_ahead_is_all_that_a_plan_needs(tmp_path):
     compiled, done = run(WORK, tmp_path)
     assert compiled == []
     assert done.stdout.split() == [str(len(code))] * 2
+    (ready,) = tmp_path.glob("ready-plan-*")
+    ready.rename(tmp_path / ready.name.replace("plan", "rehearsal"))  # a later stage, with all that a plan needs
     assert_a_plan_compiles_nothing(tmp_path)
 
 
@@ -127,15 +143,9 @@ def test_after_compiling_ahead_a_plan_compiles_nothing(tmp_path):
 def assert_a_plan_compiles_nothing(cache):
     compiled, done = run(PLAN, cache)
     assert compiled == []
+    assert "without machine code" not in done.stdout
     assert "compiling" not in done.stderr  # there is nothing to wait for
     assert "Certificate: passed" in done.stdout
-
-
-def test_a_stage_is_ready_once_a_later_one_is(monkeypatch, tmp_path):
-    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
-    assert not warm_up._ready(Stage.PLAN)
-    warm_up._ready_file(Stage.REHEARSAL).touch()
-    assert [warm_up._ready(stage) for stage in Stage] == [True, True, False]
 
 
 def test_stages_follow_one_another():

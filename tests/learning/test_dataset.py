@@ -15,11 +15,10 @@ from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.path_families import Family
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
-from cfplan.learning import workers as workers_module
 from cfplan.learning.dataset import describe, label_shard, make_dataset, read_dataset, read_timing
 from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel, load_spec
 from cfplan.learning.labels import row_limits, row_path
-from cfplan.learning.workers import SchedulerError
+from cfplan.learning.workers import SchedulerError, pool
 from cfplan.safety.feasibility import infeasible_limit
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -262,16 +261,16 @@ def test_an_unreachable_scheduler_is_an_error(tmp_path, address):
 
 
 @pytest.mark.parametrize(("workers", "reason"), [(0, "no worker"), (1, "has 2 threads")])
-def test_a_cluster_without_workers_or_with_threads_is_refused(tmp_path, monkeypatch, workers, reason):
+def test_a_cluster_without_workers_or_with_threads_is_refused(workers, reason):
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")
-    monkeypatch.setattr(workers_module, "WORKER_PATIENCE", 0.5)
     with (
         distributed.LocalCluster(
             n_workers=workers, threads_per_worker=2, processes=False, protocol="tcp://", dashboard_address=None
         ) as cluster,
         pytest.raises(SchedulerError, match=reason) as error,
+        pool(scheduler=cluster.scheduler_address, worker_patience=0.5),
     ):
-        make_dataset(tmp_path, SMALL, scheduler=cluster.scheduler_address)
+        pass
     assert f"dask worker --nworkers -1 --nthreads 1 {cluster.scheduler_address}" in error.value.hint
 
 

@@ -5,17 +5,16 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
-from multiprocessing.connection import Connection
 
 import numpy as np
 import psutil
 import pytest
-from waiting import a_moment, until
+from waiting import PATIENCE, a_moment, until
 
-from cfplan.flight.clock import REAL_CLOCK
-from cfplan.flight.pilot.proposals import _ANSWER, _BEGUN, ReceivedProposals
+from cfplan.errors import InfeasibleError
+from cfplan.flight.clock import REAL_CLOCK, Clock, SteppedClock
+from cfplan.flight.pilot.proposals import ReceivedProposals
 from cfplan.flight.setpoints.commitment import (
     LEAST_AHEAD,
     QUANTUM,
@@ -30,12 +29,12 @@ from cfplan.flight.setpoints.commitment import (
 from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
-from cfplan.planning.continuation import TooLateError, Ways
+from cfplan.planning.continuation import TooLateError
 from cfplan.planning.plan import plan
 from cfplan.preparation import certified_flight, planner_worker
 from cfplan.preparation import replan as replanning
 from cfplan.preparation.air_planner import FIRST_PART, SLACK, PathAnswer, PathRequest, PathVerdict, Wish
-from cfplan.preparation.certified_flight import EndsBadlyError
+from cfplan.preparation.certified_flight import STOP, EndsBadlyError
 from cfplan.preparation.lead import IN_TIME, LEARNED_FROM, Lead
 from cfplan.preparation.planner_process import AirPlanner
 from cfplan.preparation.planner_worker import PlannerWorker
@@ -53,23 +52,26 @@ class PilotSide:
     Where this computer is slow its time stands still until a proposal is there, so that none is late.
     """
 
-    def __init__(self, commitment, limits, connection):
-        self.commitment, self.limits = commitment, limits
-        self.proposals = ReceivedProposals(connection)
+    def __init__(self, commitment, limits, connection, clock: Clock = REAL_CLOCK):
+        self.commitment, self.limits, self.clock = commitment, limits, clock
+        self.proposals = ReceivedProposals(connection, clock)
         self.begun = 0.0
         self.given: list[Commitment | Refusal] = []
+        self.refuses: int | None = None  # number of the proposal that is refused, whatever it is
         self.silent_for: float | None = None  # s, for which the next answer is kept back
         self.told: list[PathAnswer] = []  # by the planner, and not looked at yet
 
     def begin(self, ago: float = 0.0) -> None:
-        self.begun = REAL_CLOCK.now() - ago
+        self.begun = self.clock.now() - ago
         self.proposals.begin(self.begun)
 
     def tick(self) -> None:
         proposal = self.proposals.newest()
         if proposal is not None:
-            now = min(round((REAL_CLOCK.now() - self.begun) * RATE), proposal.splice - LEAST_AHEAD)
+            now = min(round((self.clock.now() - self.begun) * RATE), proposal.splice - LEAST_AHEAD)
             answer = splice(self.commitment, proposal, now, self.limits)
+            if len(self.given) == self.refuses:
+                answer = Refusal(Fault.MOTION, "")
             if isinstance(answer, Commitment):
                 self.commitment = answer
             self.given.append(answer)
@@ -251,256 +253,271 @@ def test_of_the_stops_within_a_stop_only_that_is_sent(held, limits):
     assert Proposal.of_bytes(few) is None  # it would ask for any memory
 
 
-@contextlib.contextmanager
-def served(worker: PlannerWorker, main: Connection, pilot: Connection) -> Iterator[None]:
-    """Let a thread do the worker's work until the ends of the main process and the pilot are closed."""
+class NearlyStill(SteppedClock):
+    """A clock that goes on by a µs at each look, so that no plan is late however slow this computer is."""
 
-    def serve() -> None:
-        with contextlib.suppress(EOFError, OSError):
-            worker.serve()
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    try:
-        yield
-    finally:
-        main.close()
-        pilot.close()
-        thread.join()
+    def now(self) -> float:
+        self.reach(super().now() + 1e-6)
+        return super().now()
 
 
-def two_answers(main: Connection, pilot: PilotSide) -> list[PathAnswer]:
-    answers: list[PathAnswer] = []
+class Planner:
+    """A worker that plans by a clock of the test for a flight that has begun, served by a thread, and its pilot."""
 
-    def both_are_told() -> bool:
-        pilot.tick()
-        while main.poll():
-            answers.append(main.recv())
-        return len(answers) == 2
+    def __init__(self, held, limits):
+        self.clock = NearlyStill()
+        (self.main, requests), (self.pilots_end, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
+        self.pilot = PilotSide(held.commitment, limits, self.pilots_end, self.clock)
+        self.told: list[PathAnswer] = []
+        self.number = 0
+        worker = PlannerWorker(held, limits, requests, ours, self.clock)
+        worker.warm_up()
 
-    assert until(both_are_told)
-    return answers
+        def serve() -> None:
+            with contextlib.suppress(EOFError, OSError):
+                worker.serve()
 
+        self.thread = threading.Thread(target=serve)
+        self.thread.start()
 
-@pytest.mark.parametrize("accepted", [True, False])
-def test_another_request_is_planned_while_the_pilot_looks_at_the_last_proposal(held, limits, accepted):
-    (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
-    worker, pilot = PlannerWorker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
-    pilot.begin()
-    assert until(lambda: worker._chain.read(0.1) is None and worker._chain.begun > 0.0)
-    main.send(PathRequest(2, Wish.REPLACE, ((0.0, 0.5, 1.0),)))
-    assert worker._answer(PathRequest(1, Wish.REPLACE, ((0.5, 0.9, 1.0),)), REAL_CLOCK.now()) is None
-    assert worker._chain.held is not held  # but what it will be, if that is accepted
-    if not accepted:
-        assert until(lambda: (proposal := pilot.proposals.newest()) is not None and refused(pilot, proposal))
+    def begin(self, ago: float = 0.0) -> None:
+        """Begin the flight, and wait until the planner knows."""
+        self.pilot.begin(ago)
+        assert until(lambda: self.ask(Wish.EXTEND).reason != NOT_FLOWN)
 
-    with served(worker, main, theirs):
-        first, second = two_answers(main, pilot)
-    assert (first.number, first.verdict) == (1, PathVerdict.ACCEPTED if accepted else PathVerdict.REFUSED), first
-    assert (second.number, second.verdict) == (2, PathVerdict.ACCEPTED), second
-    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
+    def request(self, wish: Wish, waypoints=()) -> int:
+        self.number = number = self.number + 1
+        self.main.send(PathRequest(number, wish, tuple(waypoints)))
+        return number
 
+    def hear(self) -> list[PathAnswer]:
+        """Let the pilot look for a proposal; return all answers so far."""
+        self.pilot.tick()
+        while self.main.poll():
+            self.told.append(self.main.recv())
+        return self.told
 
-def comes(worker: PlannerWorker, main: Connection, request: PathRequest) -> None:
-    """Let a request wait."""
-    main.send(request)
-    assert until(lambda: worker._chain.read(0.1, or_request=True) is None and worker._requests.waiting is not None)
+    def answers(self, count: int) -> list[PathAnswer]:
+        """Wait for so many answers; return and forget them."""
+        assert until(lambda: len(self.hear()) >= count)
+        found, self.told = self.told, []
+        return found
 
+    def ask(self, wish: Wish, waypoints=()) -> PathAnswer:
+        number = self.request(wish, waypoints)
+        (answer,) = self.answers(1)
+        assert answer.number == number
+        return answer
 
-def pressed(worker: PlannerWorker, main: Connection, request: PathRequest) -> PathAnswer | None:
-    """Return what a worker answers at once to a request, where it takes others to wait."""
-    comes(worker, main, request)
-    worker._pressed = True
-    return worker._answer(*worker._requests.take())
+    def agrees(self) -> bool:
+        """Return whether the planner holds what the pilot is committed to: else the pilot refuses what follows."""
+        return self.ask(Wish.REPLACE, [(0.0, 0.5, 1.0)]).verdict is PathVerdict.ACCEPTED
+
+    def end(self) -> None:
+        self.main.close()
+        self.pilots_end.close()
+        self.thread.join()
 
 
 @pytest.fixture
-def in_flight(held, limits, monkeypatch):
-    """A worker that plans for a flight that has begun, the main process's end of its requests, and the pilot's side."""
-    monkeypatch.setattr(PlannerWorker, "_late_by", lambda *_: -1.0)  # however slow this computer is
-    (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
-    worker, pilot = PlannerWorker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
-    pilot.begin()
-    assert until(lambda: worker._chain.read(0.1) is None and worker._chain.begun > 0.0)
-    worker._meanwhile.note(0.05, only=True)  # else all of a plan is committed at once
-    return worker, main, pilot, theirs
+def idle(held, limits):
+    planner = Planner(held, limits)
+    yield planner
+    planner.end()
 
 
-FIRST, SECOND = PathRequest(1, Wish.REPLACE, FAR), PathRequest(2, Wish.REPLACE, FAR[1:])
+@pytest.fixture
+def in_flight(idle):
+    idle.begin()
+    return idle
 
 
-def once_failing(monkeypatch) -> None:
-    """Let the next simulation of a plan that goes on beside fail."""
-    simulate, failed = certified_flight._simulate, []
+@pytest.fixture
+def while_planning(monkeypatch):
+    """Call it with acts: one is done each time that a request begins to be planned; return the list of those left."""
+    plan_request, acts = planner_worker.plan_request, []
 
-    def fails_once(*given):
-        if not failed:
-            failed.append(True)
-            raise EndsBadlyError("it ends outside", where="link loss")
-        return simulate(*given)
+    def plan_after_act(*given):
+        if acts:
+            acts.pop(0)()
+        return plan_request(*given)
 
-    monkeypatch.setattr(certified_flight, "_simulate", fails_once)
+    monkeypatch.setattr(planner_worker, "plan_request", plan_after_act)
+
+    def set_acts(*given):
+        acts.extend(given)
+        return acts
+
+    return set_acts
+
+
+@pytest.fixture
+def simulation(monkeypatch):
+    """Acts that are done before the next simulations of link loss; they may fail."""
+    link_loss, acts = certified_flight.link_loss_at_walls, []
+
+    def simulate_after_act(*given, **named):
+        if acts:
+            acts.pop(0)()
+        return link_loss(*given, **named)
+
+    monkeypatch.setattr(certified_flight, "link_loss_at_walls", simulate_after_act)
+    return acts
+
+
+def ends_badly() -> None:
+    raise EndsBadlyError("it ends outside", where="link loss")
+
+
+PLACES = [(0.5, 0.9, 1.0)]
+WAITS = [(0.0, 0.5, 1.0)]
+
+
+@pytest.mark.parametrize("accepted", [True, False])
+def test_another_request_is_planned_while_the_pilot_looks_at_the_last_proposal(in_flight, while_planning, accepted):
+    planner = in_flight
+    left = while_planning(lambda: planner.request(Wish.REPLACE, WAITS), lambda: None)
+    if not accepted:
+        planner.pilot.refuses = 0
+    number = planner.request(Wish.REPLACE, PLACES)
+    assert until(lambda: not left)  # the second is planned, though the pilot has not looked
+    assert not planner.pilot.given
+    first, second = planner.answers(2)
+    assert (first.number, first.verdict) == (number, PathVerdict.ACCEPTED if accepted else PathVerdict.REFUSED), first
+    assert (second.number, second.verdict) == (number + 1, PathVerdict.ACCEPTED), second
+    assert planner.agrees()
 
 
 @pytest.mark.parametrize("passes", [True, False])
-def test_while_requests_press_one_is_planned_on_what_is_simulated_still(in_flight, monkeypatch, passes):
+def test_while_requests_press_one_is_planned_on_what_is_simulated_still(in_flight, while_planning, simulation, passes):
     """Where that does not pass, it is planned again on what the pilot is bound to."""
-    worker, main, pilot, theirs = in_flight
-    if not passes:
-        once_failing(monkeypatch)
-    before = worker._chain.held
-    assert pressed(worker, main, FIRST) is None
-    assert worker._chain.held is not before
-    assert pilot.proposals.newest() is None  # it is held back
-    comes(worker, main, SECOND)
-    with served(worker, main, theirs):
-        first, second = two_answers(main, pilot)
-    assert (first.number, first.verdict) == (1, PathVerdict.ACCEPTED if passes else PathVerdict.SUPERSEDED), first
+    planner, planned = in_flight, threading.Event()
+
+    def simulate_long():
+        assert planned.wait(PATIENCE)  # before that the next request begins to be planned
+        if not passes:
+            ends_badly()
+
+    def press():
+        simulation.append(simulate_long)
+        planner.request(Wish.REPLACE, FAR[1:])
+
+    while_planning(lambda: planner.request(Wish.REPLACE, FAR), press, planned.set)
+    number = planner.request(Wish.REPLACE, PLACES)
+    zeroth, first, second = planner.answers(3)
+    assert (zeroth.number, zeroth.verdict) == (number, PathVerdict.ACCEPTED), zeroth
+    verdict = PathVerdict.ACCEPTED if passes else PathVerdict.SUPERSEDED
+    assert (first.number, first.verdict) == (number + 1, verdict), first
     assert passes or "it ends outside" in first.reason
-    assert (second.number, second.verdict) == (2, PathVerdict.ACCEPTED), second
-    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
+    assert (second.number, second.verdict) == (number + 2, PathVerdict.ACCEPTED), second
+    assert planner.agrees()
 
 
-@contextlib.contextmanager
-def looking(pilot: PilotSide) -> Iterator[None]:
-    """Let a thread look for the pilot at what is proposed."""
-    ended = threading.Event()
-
-    def look() -> None:
-        while not ended.wait(0.001):
-            pilot.tick()
-
-    thread = threading.Thread(target=look)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
+def test_several_on_their_way_are_accepted_in_order(in_flight, while_planning):
+    planner = in_flight
+    while_planning(*(lambda far=far: planner.request(Wish.REPLACE, far) for far in (FAR, FAR[1:], FAR[2:])))
+    number = planner.request(Wish.REPLACE, PLACES)
+    told = planner.answers(4)
+    assert [(each.number, each.verdict) for each in told] == [(number + n, PathVerdict.ACCEPTED) for n in range(4)]
+    assert [each.splice for each in told] == [commitment.splices[-1] for commitment in planner.pilot.given]
+    assert planner.agrees()
 
 
-def test_three_on_their_way_are_accepted_in_order(in_flight):
-    worker, main, pilot, theirs = in_flight
-    third = PathRequest(3, Wish.REPLACE, FAR[2:])
-    with looking(pilot):
-        assert [pressed(worker, main, each) for each in (FIRST, SECOND, third)] == [None] * 3
-        worker._chain.settle()
-    told = [main.recv() for _ in range(3)]
-    assert [(each.number, each.verdict) for each in told] == [(n, PathVerdict.ACCEPTED) for n in (1, 2, 3)]
-    assert [each.splice for each in told] == sorted(each.splice for each in told)
-    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
-    theirs.close()
+def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses(in_flight, while_planning):
+    planner, commitment = in_flight, lambda: in_flight.pilot.commitment
+    while_planning(lambda: planner.request(Wish.REPLACE, FAR))
+    planner.request(Wish.REPLACE, PLACES)
+    _, pressed = planner.answers(2)
+    assert commitment().motion_ends - pressed.joint * RATE <= FIRST_PART * RATE + STOP
+
+    def to_its_end() -> bool:
+        planner.clock.sleep(0.01)
+        planner.hear()
+        return bool(np.abs(decode(commitment().payloads[-1:]).position[0] - FAR[-1]).max() < 2e-3)
+
+    assert until(to_its_end)
 
 
-def test_what_was_committed_in_haste_is_committed_to_its_end_once_nobody_presses(in_flight):
-    worker, main, pilot, theirs = in_flight
-    assert pressed(worker, main, FIRST) is None
-    first = worker._chain.held
-    with served(worker, main, theirs):
-
-        def to_its_end() -> bool:
-            pilot.tick()
-            end = decode(pilot.commitment.payloads[-1:]).position[0]
-            heard = worker._chain.held.commitment.checksum == pilot.commitment.checksum
-            return heard and bool(np.abs(end - FAR[-1]).max() < 2e-3)
-
-        assert until(to_its_end)
-    assert first.stops_from - pilot.commitment.splices[0] <= round(FIRST_PART * RATE)
+LONG = 0.2  # s
 
 
 @pytest.mark.parametrize("what", ["plan", "checks"])
 def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monkeypatch, what):
     """They may take longer than those of most plans, and do so again."""
-    worker, _, pilot, theirs = in_flight
-    long, begun, firsts, others, planned = 0.2, REAL_CLOCK.now(), [], [], worker._planned
-    now = begun
-    worker._plans.note(0.05, only=True)
+    planner, plan_request, ahead, others, needed = in_flight, planner_worker.plan_request, [], [], []
 
-    class Standing:
-        def now(self):
-            return now
-
-    monkeypatch.setattr(planner_worker, "REAL_CLOCK", Standing())
-    monkeypatch.setattr(worker, "_late_by", lambda splice: 1.0 if len(firsts) == 1 and now > begun else -1.0)
-
-    def takes_long(request, first, part, attempt):
-        nonlocal now
-        firsts.append(first - worker._in_time_for(0.0))
-        others.append(attempt.in_time() - worker._in_time_for(0.0))
-        made = planned(request, first, part, attempt)
-        now += long
-        if what == "plan" and len(firsts) == 1:
-            raise TooLateError("the plan was not made in time")
+    def takes_long_once(held, request, first, limits, part, attempt):
+        due = (planner.clock.now() - planner.pilot.begun) * RATE
+        ahead.append(first - due)
+        others.append(attempt.in_time() - due)
+        made = plan_request(held, request, first, limits, part, attempt)
+        if len(ahead) == 1:
+            planner.clock.sleep(LONG)
+            searched = attempt.ways.searched  # by this computer's clock; once a way is known nobody searches
+            needed.append(LONG - searched if what == "plan" else LONG + made.plan.seconds - searched)
+            if what == "plan":
+                raise TooLateError("the plan was not made in time")
         return made
 
-    monkeypatch.setattr(worker, "_planned", takes_long)
-    with looking(pilot):
-        answer = worker._answer(FIRST, now)
+    monkeypatch.setattr(planner_worker, "plan_request", takes_long_once)
+    answer = planner.ask(Wish.REPLACE, FAR)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
-    assert firsts[0] < firsts[1] == pytest.approx(long * RATE, abs=2)
-    assert (others[1] > long * RATE) is (what == "checks")  # other joints must leave time for these too
-    theirs.close()
+    assert ahead[1] - ahead[0] == pytest.approx(needed[0] * RATE, abs=2)
+    assert (others[1] - others[0] > LONG * RATE) is (what == "checks")  # other joints must leave time for these too
 
 
 def test_a_plan_along_the_path_left_has_the_time_that_such_plans_leave_the_motion_as_it_is(in_flight, monkeypatch):
-    worker, *_ = in_flight
-    at_once, along = Ways((0, 1)), Ways((2, 0))
-    for ways, equal in ((at_once, 1), (along, 5)):
-        for _ in range(20):
-            worker._too_late(0.0, ways, 100, equal)
-    for late_by in (0.0, 0.04):
-        monkeypatch.setattr(worker, "_late_by", lambda splice, late_by=late_by: late_by)
-        assert worker._too_late(0.0, at_once, 100, None) is (late_by > 0.01)
-        assert not worker._too_late(0.0, along, 100, None)
+    planner, soonest = in_flight, {}
+
+    def learn(held, request, first, limits, part, attempt):
+        for found, equal in (((0, 1), 1), ((2, 0), 5)):
+            attempt.ways.found = found
+            for _ in range(20):
+                attempt.too_late(first, equal)
+        for found in ((0, 1), (2, 0)):
+            attempt.ways.found = found
+            around = range(first - 20, first + 20)
+            soonest[found] = next(splice for splice in around if not attempt.too_late(splice, None))
+        raise InfeasibleError("it is enough")
+
+    monkeypatch.setattr(planner_worker, "plan_request", learn)
+    planner.ask(Wish.STOP)
+    assert soonest[0, 1] - soonest[2, 0] == 5 - 1
 
 
 @pytest.mark.parametrize("falls", ["in its simulation", "as the pilot refuses it"])
-def test_the_latest_request_is_planned_again_where_it_was_planned_in_haste(in_flight, monkeypatch, falls):
-    worker, main, pilot, theirs = in_flight
-    if falls == "in its simulation":
-        once_failing(monkeypatch)
-    assert pressed(worker, main, FIRST) is None
+def test_the_latest_request_is_planned_again_if_it_was_in_haste(in_flight, while_planning, simulation, falls):
+    planner = in_flight
     if falls == "as the pilot refuses it":
-        worker._chain.release()
-        assert until(lambda: (proposal := pilot.proposals.newest()) is not None and refused(pilot, proposal))
-    with served(worker, main, theirs):
-        answers: list[PathAnswer] = []
+        planner.pilot.refuses = 1
 
-        def told() -> bool:
-            pilot.tick()
-            return main.poll()
+    def press():
+        if falls == "in its simulation":
+            simulation.append(ends_badly)
 
-        assert until(told)
-        answers.append(main.recv())
-    assert [(each.number, each.verdict) for each in answers] == [(1, PathVerdict.ACCEPTED)]
-    assert worker._chain.held.commitment.checksum == pilot.commitment.checksum
-
-
-def refused(pilot: PilotSide, proposal: Proposal) -> bool:
-    pilot.proposals.answer(proposal, Refusal(Fault.MOTION, ""))
-    return True
+    left = while_planning(lambda: planner.request(Wish.REPLACE, FAR), press, lambda: None)  # and once more
+    number = planner.request(Wish.REPLACE, PLACES)
+    told = planner.answers(2)
+    assert [(each.number, each.verdict) for each in told] == [(number + n, PathVerdict.ACCEPTED) for n in range(2)]
+    assert not left
+    assert planner.agrees()
 
 
-def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(held, limits, monkeypatch):
+def test_what_ends_badly_far_ahead_is_accepted_and_flown_slower_soon(idle, monkeypatch):
     """Link loss is foreseen to end outside where the vehicle is fast 3 s or more behind what is certified."""
-    monkeypatch.setattr(PlannerWorker, "_late_by", lambda *_: -1.0)  # however slow this computer is
-    (main, requests), (theirs, ours) = multiprocessing.Pipe(), multiprocessing.Pipe()
-    worker, pilot = PlannerWorker(held, limits, requests, ours), PilotSide(held.commitment, limits, theirs)
-    worker.warm_up()
 
     def foresee(payloads, limits, starts):
         if np.linalg.norm(decode(payloads).velocity, axis=1)[300:].max(initial=0.0) > 1.3:
-            raise EndsBadlyError("it ends outside", where="link loss")
+            ends_badly()
 
     for module in (certified_flight, replanning):
         monkeypatch.setattr(module, "foresee_link_loss", foresee)
 
-    with served(worker, main, theirs):
-        pilot.begin(ago=0.5)  # as soon as it has begun, now and then no way leads on
-        assert until(lambda: worker._chain.begun > 0.0)
-        main.send(PathRequest(1, Wish.REPLACE, FAR))
-        answers = two_answers(main, pilot)
-    assert [(each.number, each.verdict) for each in answers] == [(1, PathVerdict.ACCEPTED), (1, PathVerdict.CHANGED)]
+    idle.begin(ago=0.5)  # as soon as it has begun, now and then no way leads on
+    number = idle.request(Wish.REPLACE, FAR)
+    answers = idle.answers(2)
+    told = [(each.number, each.verdict) for each in answers]
+    assert told == [(number, PathVerdict.ACCEPTED), (number, PathVerdict.CHANGED)]
     first, slower = (fastest(each.plan.trajectory, 4.0) for each in answers)
     assert slower < 1.3 < first
 
@@ -509,16 +526,12 @@ def fastest(trajectory, begin):
     return np.linalg.norm(trajectory.at(np.arange(begin, trajectory.duration, 0.02)).velocity, axis=1).max()
 
 
-def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(held, limits):
+def test_a_fault_in_planning_is_an_answer_and_what_is_held_stays(in_flight):
     """The process would else be gone for the rest of the flight."""
-    (_main, requests), (pilot, proposals) = multiprocessing.Pipe(), multiprocessing.Pipe()
-    worker = PlannerWorker(held, limits, requests, proposals)
-    pilot.send_bytes(_ANSWER.pack(_BEGUN, 0, 0, REAL_CLOCK.now()))
-    worker._chain.read(1.0)
-    answer = worker._answer(PathRequest(1, Wish.REPLACE, ("no", "numbers")), REAL_CLOCK.now())
+    answer = in_flight.ask(Wish.REPLACE, ("no", "numbers"))
     assert answer.verdict is PathVerdict.REFUSED
     assert "fault in the planner: ValueError" in answer.reason
-    assert worker._chain.held is held
+    assert in_flight.agrees()
 
 
 def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):

@@ -11,7 +11,10 @@ import pytest
 
 import cfplan
 from cfplan.errors import ExitCode
-from cfplan.simulation.virtual_crazyflie import battery
+from cfplan.simulation.virtual_crazyflie.battery import CAPACITY
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.steering.steered_vehicle import SteeredVehicle
+from cfplan.steering.stepped_steering import SteppedSteering
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -43,10 +46,10 @@ def test_a_tour_of_random_waypoints_goes_on(vehicle):
 
 
 @pytest.mark.slow
-def test_a_tour_goes_on_for_ten_minutes_with_a_battery_that_lasts(limits, monkeypatch):
-    monkeypatch.setattr(battery, "_CAPACITY", 10.0 * battery._CAPACITY)
+def test_a_tour_goes_on_for_ten_minutes_with_a_battery_that_lasts(limits):
     lasting = replace(limits, battery=replace(limits.battery, endurance=900.0))
-    with cfplan.connect("sim://0", stepped=True, safety=lasting, records=None) as vehicle:
+    flight = SteppedSteering(lasting, vehicle=VehicleSettings(capacity=10.0 * CAPACITY))
+    with SteeredVehicle(flight, lasting, uri="sim://0") as vehicle:
         accepted, refused = example("random_tour").fly(vehicle, 600.0)
     assert vehicle.outcome.exit_code is ExitCode.OK
     assert vehicle.outcome.deviation.max < 0.05

@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,16 +11,16 @@ from rerun.chunk import RrdReader
 import cfplan
 from cfplan.cli import cfplan as command_line
 from cfplan.errors import InputError, NotCertifiedError
+from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.preparation.air_planner import PathVerdict
-from cfplan.preparation.replan import hold_hover, stop_within
 from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_IN_FLIGHT
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.record_view import write_rrd
-from cfplan.steering.recertify import _goes_on, _joints_told, recertify
+from cfplan.steering.recertify import recertify
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
 
@@ -99,18 +98,16 @@ def test_a_plan_that_goes_on_behind_a_stop_is_recorded_and_certified_again(limit
     assert checked.stops == (turned.stop > 0)
 
 
-def test_of_plans_from_one_splice_each_has_its_own_joint():
-    """A plan, a stop, and another plan; what was refused has no splice."""
-    answers = SimpleNamespace(splice=np.array([79, -1, 79, 79]), joint=np.array([0.9, np.nan, 0.79, 0.94]))
-    joints = _joints_told(SimpleNamespace(answers=answers))
-    assert list(joints[79]) == [0.9, 0.94]
-    assert not joints[80]
-
-
-def test_a_stop_where_the_vehicle_rests_anyway_is_not_taken_for_more_of_its_plan(limits):
-    held = hold_hover((0.0, 0.0, 0.8), 0.0, limits)
-    told = stop_within(held, 20, 0.5, limits).proposal.payloads
-    assert not _goes_on(held.flown, 20, told, limits)
+def test_a_stop_or_a_refusal_beside_a_plan_is_not_taken_for_its_joint(folder):
+    """Each may come from the same splice; what was refused has none."""
+    record = read_record(folder)
+    answers, splice = record.answers, record.commitments.splice[with_a_plan(record)[1]]
+    (row,) = np.flatnonzero(answers.splice == splice)
+    rows = np.insert(np.arange(len(answers.splice)), row, [row, row])
+    columns = {name: getattr(answers, name)[rows] for name in type(answers).__slots__}
+    columns["splice"][[row, row + 1]] = splice, -1
+    columns["joint"][[row, row + 1]] = splice / RATE, np.nan
+    assert recertify(replace(record, answers=replace(answers, **columns))).joints == 5
 
 
 def test_the_command_line_says_so(folder):

@@ -151,8 +151,10 @@ def test_a_vehicle_asked_to_rest_where_it_passes_comes_back_there(flown):
     vehicle, flight = flown
     vehicle.fly([[1, 0, 1], [1, 2, 1]])
     vehicle.sleep(0.9)
-    joint = vehicle.time - vehicle._begun + 0.2
-    place = flight.planner.held.flown.at(joint).position
+    path = flight.planner.held.flown
+    times = np.arange(0.0, path.duration, 0.01)
+    now = times[np.argmin(np.linalg.norm(path.at(times).position - vehicle.position, axis=1))]
+    place = path.at(now + 0.2).position
     assert vehicle.speed > 0.8
     assert vehicle.fly([place]).verdict is PathVerdict.ACCEPTED
     vehicle.wait()

@@ -99,7 +99,7 @@ class TimedLines(QueuedLines):
 
     def __init__(self, lines: Iterable[tuple[float, str]]):
         super().__init__()
-        self._lines = list(lines)
+        self.left = list(lines)
         self.answers: list[str] = []
         self.ordered = math.nan  # s, when the last line was taken
         self.flight: SteppedSteering | None = None
@@ -107,15 +107,16 @@ class TimedLines(QueuedLines):
 
     def orders(self) -> Iterator[Order]:
         now = self.flight.clock.now()
-        while self._lines and now >= self._begun + self._lines[0][0]:
+        while self.left and now >= self._begun + self.left[0][0]:
             self.ordered = now
-            self.take(self._lines.pop(0)[1].encode(), self.answers.append)
+            self.take(self.left.pop(0)[1].encode(), self.answers.append)
         return super().orders()
 
     def next(self, patience: float) -> TextLine | None:
-        if self._queue.empty():
+        line = super().next(0.0)
+        if line is None:
             self.flight.wait(lambda: False, patience)
-        return super().next(0.0)
+        return line
 
     def begin(self) -> None:
         self._begun = self.flight.clock.now()
@@ -134,7 +135,7 @@ def test_an_order_waits_for_no_line_before_it(limits, order, reason, fault):
         vehicle.take_off(0.8)
         flight.planner.fault = fault
         lines.begin()
-        flight.wait(lambda: lines._queue.qsize() == 30, 1.0)
+        flight.wait(lambda: len(lines.left) == 3, 1.0)  # 30 are taken
         steer_by_lines(vehicle, lines)
         assert reason in vehicle.outcome.reason
     truth = flight.lab.truth()

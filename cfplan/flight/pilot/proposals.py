@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from typing import Protocol
 
-from cfplan.flight.clock import REAL_CLOCK
+from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
 LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
@@ -87,9 +87,9 @@ class ReceivedProposals(HeldProposals):
     A planner that died, hangs or sends what is no proposal is one that proposes nothing.
     """
 
-    def __init__(self, connection: Connection):
+    def __init__(self, connection: Connection, clock: Clock = REAL_CLOCK):
         super().__init__(self._answer)
-        self._connection = connection
+        self._connection, self._clock = connection, clock
         self._answers: SimpleQueue[bytes] = SimpleQueue()
         self._came = (0, 0.0)  # checksum of the proposal that came last, and when, s
         self._given = threading.Event()
@@ -101,7 +101,7 @@ class ReceivedProposals(HeldProposals):
         self._given.set()
 
     def wait(self, patience: float) -> bool:
-        return REAL_CLOCK.wait(self._given, patience)
+        return self._clock.wait(self._given, patience)
 
     def newest(self) -> Proposal | None:
         self._given.clear()
@@ -125,7 +125,7 @@ class ReceivedProposals(HeldProposals):
                 with contextlib.suppress(Exception):  # skip a message that cannot be read
                     proposal = Proposal.of_bytes(message)
                 if proposal is not None:
-                    self._came = proposal.checksum, REAL_CLOCK.now()
+                    self._came = proposal.checksum, self._clock.now()
                     self.give(proposal)
 
     def _write(self) -> None:

@@ -30,11 +30,12 @@ def connect(
     *,
     waiting: Callable[[], None] = lambda: None,
     clock: Clock = REAL_CLOCK,
+    patience: float = FIRST_ANSWER,
 ) -> Link:
     """Connect, and end the state in which an earlier connection left the vehicle.
 
     `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while nothing happens, and may raise.
-    Raises LinkError, within 5 s if nothing answers.
+    Raises LinkError, after `patience`, s, and within 1 s more, if nothing answers.
     """
     from cflib import crtp
     from cflib.crazyflie import Crazyflie
@@ -70,7 +71,7 @@ def connect(
 
     threading.Thread(target=open_link, daemon=True).start()
     try:
-        _wait(answered, failed, FIRST_ANSWER, waiting, clock)
+        _wait(answered, failed, patience, waiting, clock)
         if not failed.is_set() and not answered.is_set():
             raise LinkError("nothing answers", where=uri, hint=_hint(uri, ""))
         _wait(complete, failed, WHOLE_CONNECTION, waiting, clock)

@@ -493,7 +493,7 @@ def _harmless(
                 aside, up_z = pair_in(panel, _LEANING, n)
                 upright = math.atan2(aside, up_z)  # the turn after which the axis leans least, by acos(reached)
                 reached = math.sqrt(aside * aside + up_z * up_z)
-                widest = upright + math.acos(min(_LEAST_LIFT / reached, 1.0))
+                widest = upright + math.acos(_LEAST_LIFT / max(reached, _LEAST_LIFT))
                 panel[_ALLOWED * WIDTH + n] = full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi))
         _leave_excesses(panel, lanes)
         give_out(out, begin, panel, _HARMLESS)

@@ -4,7 +4,7 @@ The firmware makes up for a falling voltage by duty cycle until there is none le
 motor of the 2.1+ gives 0.113, 0.166 and 0.193 N at most, and is never asked for more than 0.12 N.
 """
 
-_CAPACITY = 250e-3 * 3600  # A s
+CAPACITY = 250e-3 * 3600  # A s
 _RESISTANCE = 0.2  # Ω: 4.2 V at rest and 3.30 V at 4.44 A, Bitcraze's table of thrust and current
 _CURRENT, _AT_THRUST = 4.44, 0.568  # A at N, the same table
 _IDLE_CURRENT = 0.15  # A
@@ -16,8 +16,8 @@ _FULL_ABOVE, _LOSS = 3.066, 0.106 / 0.12
 class Battery:
     """A battery; `charge` is the share of the capacity that is left."""
 
-    def __init__(self, charge: float = 1.0):
-        self.charge = charge
+    def __init__(self, charge: float = 1.0, capacity: float = CAPACITY):
+        self.charge, self._capacity = charge, capacity  # A s
         self.voltage = self._at_rest
         self.sag = 0.0  # V by which the voltage is lower than a healthy battery's
 
@@ -28,7 +28,7 @@ class Battery:
     def drain(self, thrust: float, seconds: float) -> None:
         """Draw the current for `thrust`, N, of all motors together, for some seconds."""
         current = _IDLE_CURRENT + _CURRENT * (max(thrust, 0.0) / _AT_THRUST) ** 1.5
-        self.charge = max(0.0, self.charge - current * seconds / _CAPACITY)
+        self.charge = max(0.0, self.charge - current * seconds / self._capacity)
         self.voltage = self._at_rest - _RESISTANCE * current - self.sag
 
     @property

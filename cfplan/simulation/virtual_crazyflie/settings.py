@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from cfplan.simulation.virtual_crazyflie.battery import CAPACITY
 from cfplan.simulation.virtual_crazyflie.services import FIRMWARE_VERSION, PROTOCOL_VERSION
 
 
@@ -32,6 +33,7 @@ class VehicleSettings:
     auto_arming: bool | None = None
     """None: as the airframe's name says; brushed vehicles arm themselves, brushless ones wait for a request."""
     charge: float = 1.0  # share of the battery's capacity
+    capacity: float = CAPACITY  # A s, of the battery
     sensors: Sensors = field(default_factory=Sensors)
     protocol: int = PROTOCOL_VERSION
     firmware: str = FIRMWARE_VERSION

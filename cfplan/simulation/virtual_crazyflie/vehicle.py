@@ -69,7 +69,7 @@ class VirtualCrazyflie:
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
         self._estimator: int | None = None  # that a deck has chosen
         self._runs_from: float = 0  # tick from which its processor listens and answers
-        self.battery = Battery(self.settings.charge)
+        self.battery = Battery(self.settings.charge, self.settings.capacity)
         self._boot()
 
     def _boot(self) -> None:

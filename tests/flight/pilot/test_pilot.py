@@ -7,7 +7,6 @@ from itertools import pairwise
 import pytest
 
 from cfplan.errors import ExitCode, InputError
-from cfplan.flight.pilot import landing
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase, PoseReceived, SetpointSent
@@ -367,8 +366,9 @@ def test_without_poses_the_motors_stop_where_the_vehicle_believes_itself_beneath
     assert -0.05 < world.position[2] - (standing - 0.3) < 0.0
 
 
-def test_without_poses_the_motors_stop_in_time_wherever_the_vehicle_is(world, fly, monkeypatch):
-    monkeypatch.setattr(landing, "_BENEATH", math.inf)  # as if it were higher and still above the floor
+def test_without_poses_the_motors_stop_in_time_wherever_the_vehicle_is(world, fly):
+    """With estimates gone too, nothing tells that it is beneath the floor."""
+    world.when(Phase.HOLD, 0.0, lambda: setattr(world, "estimate_silent", True))
     world.when(Phase.HOLD, 0.0, lambda: setattr(world, "floor", -10.0))
     world.when(Phase.HOLD, 0.0, lambda: stop_poses(world))
     outcome = fly()

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from cfplan.flight.setpoints import rate_trade
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import (
@@ -149,22 +148,6 @@ def test_a_setpoint_does_not_depend_on_those_beside_it(count):
         for name in FullStateSetpoints.__slots__:
             np.testing.assert_array_equal(getattr(together, name)[n], getattr(alone, name)[0], err_msg=name)
         assert harmless[n] == pytest.approx(harmless_rates(one, coming[n : n + 1])[0], abs=1e-12)
-
-
-@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, np.pi / 2, 0.0)])
-@pytest.mark.parametrize("rate", [0.0, 30.0])
-def test_a_motion_at_rest_or_turned_fast_is_no_error_without_machine_code(turn, rate, monkeypatch):
-    """A new computer flies so while it compiles; what compiled code takes in its stride is an error there."""
-    none, quaternion = np.zeros((2, 3)), Rotation.from_euler("xyz", [turn, turn]).as_quat()
-    motion = FullStateSetpoints(none, none, none, quaternion, np.full((2, 3), rate))
-    compiled = trade_rates(motion, none), harmless_rates(motion, none)
-    for name in ("_traded", "_harmless"):
-        monkeypatch.setattr(rate_trade, name, getattr(rate_trade, name).py_func)
-    with np.errstate(all="ignore"):  # as without_compiling() has it
-        interpreted = trade_rates(motion, none), harmless_rates(motion, none)
-    for name in FullStateSetpoints.__slots__:
-        np.testing.assert_allclose(getattr(interpreted[0], name), getattr(compiled[0], name), atol=1e-12, err_msg=name)
-    np.testing.assert_allclose(interpreted[1], compiled[1], atol=1e-12)
 
 
 def test_an_attitude_that_leans_as_far_itself_is_only_righted():

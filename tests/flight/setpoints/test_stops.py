@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from cfplan.flight.setpoints import stops
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import UNTIL_WATCHDOG
@@ -100,15 +99,3 @@ def test_many_stops_are_those_that_are_made_one_by_one(circle):
     whole = encode_stops(circle, 100.0)
     for row in (0, 5, 199, 200, 280):
         np.testing.assert_array_equal(encode_stops(circle, 100.0, rows=np.array([row])), whole[[row]])
-
-
-@pytest.mark.parametrize("count", [1, 2, 300])
-def test_stops_by_loops_are_those_by_arrays(circle, monkeypatch, count):
-    few = FullStateSetpoints(*(getattr(circle, name)[:count] for name in FullStateSetpoints.__slots__))
-    rows = np.arange(count)
-    by_loops, coming = stop_motion(few, rows, 100.0)
-    monkeypatch.setattr(stops, "_stop_rows", stops._stop_rows_interpreted)
-    by_arrays, coming_by_arrays = stop_motion(few, rows, 100.0)
-    for name in FullStateSetpoints.__slots__:
-        np.testing.assert_allclose(getattr(by_loops, name), getattr(by_arrays, name), rtol=0, atol=1e-11)
-    np.testing.assert_allclose(coming, coming_by_arrays, rtol=0, atol=1e-12)

@@ -86,12 +86,19 @@ def test_a_view_that_breaks_is_not_heard_of_in_the_flight(flight, monkeypatch):
     assert "the viewer was closed" in view.failure
 
 
-def test_a_view_that_cannot_keep_up_leaves_the_oldest_out(flight):
-    view = LiveView(rr.RecordingStream("cfplan"), flight.header)  # whose thread never begins
-    for _ in range(3 * live.CAPACITY // len(flight.messages) + 1):
-        for message in flight.messages:
-            view.show(message)
-    assert len(view._waiting) == live.CAPACITY
+def test_a_view_that_cannot_keep_up_leaves_the_oldest_out(flight, tmp_path):
+    stream = rr.RecordingStream("cfplan")
+    stream.save(tmp_path / "live.rrd")
+    view = LiveView(stream, flight.header, clock=SteppedClock())
+    first = next(message for message in flight.messages if isinstance(message, PhaseEntered))
+    pose = next(message for message in flight.messages if isinstance(message, PoseReceived))
+    view.show(first)
+    for _ in range(live.CAPACITY):
+        view.show(pose)
+    with view:
+        pass
+    assert rows(tmp_path / "live.rrd", layout.BODY, "Transform3D:translation")
+    assert not rows(tmp_path / "live.rrd", layout.PHASES, "StateChange:state")
 
 
 def test_a_view_of_a_flight_that_says_nothing_is_no_failure(flight):

@@ -13,7 +13,7 @@ from waiting import PATIENCE, a_moment, until
 
 from cfplan.errors import LinkError
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
-from cfplan.flight.radio import connection
+from cfplan.flight.radio.connection import connect
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
@@ -69,9 +69,8 @@ def open_link(**settings):
     vehicle.advance(_STEP)  # compiles if need be, for which nothing waits
     driver = type("Driver", (DirectDriver,), {"vehicle": vehicle})
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(connection, "FIRST_ANSWER", PATIENCE)
         patch.setattr(crtp, "CLASSES", [driver])
-        link = connection.connect("direct://0", lambda message: None, [driver])
+        link = connect("direct://0", lambda message: None, [driver], patience=PATIENCE)
         yield link, driver
         driver.silent = False
         link.close()

@@ -215,25 +215,44 @@ def test_a_variable_can_be_fetched_in_another_type(rig):
     assert 4000 < struct.unpack("<f", data_packets(rig)[-1][5:])[0] < 4200
 
 
-def test_values_have_the_firmwares_units_and_signs(hovering):
-    def value(name):
-        return hovering.vehicle.log._getters[log_id(name)]()
+def logged_now(rig, *names):
+    """{name: value as it is logged}, and what the vehicle believes at that moment."""
+    blocks = [names[first : first + MOST_BYTES // 4] for first in range(0, len(names), MOST_BYTES // 4)]
+    for number, block in enumerate(blocks):
+        assert create(rig, number, *block) == 0
+        log_command(rig, 3, number, 1)
+    before = len(data_packets(rig))
+    while len(data_packets(rig)) == before:
+        belief = rig.belief.copy()
+        rig.run(0.001)
+    came = data_packets(rig)[before:]
+    assert len(came) == len(blocks)
+    values = {}
+    for block, packet in zip(blocks, came, strict=True):
+        values |= dict(zip(block, struct.unpack(f"<{len(block)}f", packet[5:]), strict=True))
+    return values, belief
 
+
+def test_values_have_the_firmwares_units_and_signs(hovering):
     hovering.go_to(0.5, 0.0, 1.0, yaw=0.6, duration=1.5)
     hovering.run(0.6)
-    belief = hovering.belief
-    assert value("stateEstimateZ.x") == pytest.approx(1000 * belief[0])
-    assert value("stateEstimateZ.rateYaw") == pytest.approx(1000 * belief[12])
-    assert value("stateEstimateZ.ratePitch") == pytest.approx(-1000 * belief[11])  # legacy sign
-    assert value("gyro.z") == pytest.approx(np.degrees(belief[12]))
-    assert 0.8 < value("acc.z") < 1.2  # g
-    assert abs(value("stateEstimate.az")) < 0.2  # g, gravity taken off
-    assert 8000 < value("stateEstimateZ.az") < 12000  # mm/s², gravity left in
-    assert value("stabilizer.pitch") * value("stateEstimate.vx") < 0 or value("stateEstimate.vx") < 0.05
-    assert value("stateEstimate.yaw") == pytest.approx(np.degrees(2 * np.arctan2(belief[8], belief[9])), abs=2)
-    assert 30000 < value("motor.m1") < 60000
-    assert value("pm.vbat") < 4.05  # it sags under load
-    assert value("ctrltarget.mode_x") == 1
+    value, belief = logged_now(
+        hovering, "stateEstimateZ.x", "stateEstimateZ.rateYaw", "stateEstimateZ.ratePitch", "gyro.z", "acc.z",
+        "stateEstimate.az", "stateEstimateZ.az", "stabilizer.pitch", "stateEstimate.vx", "stateEstimate.yaw",
+        "motor.m1", "pm.vbat", "ctrltarget.mode_x",
+    )  # fmt: skip
+    assert value["stateEstimateZ.x"] == pytest.approx(1000 * belief[0])
+    assert value["stateEstimateZ.rateYaw"] == pytest.approx(1000 * belief[12])
+    assert value["stateEstimateZ.ratePitch"] == pytest.approx(-1000 * belief[11])  # legacy sign
+    assert value["gyro.z"] == pytest.approx(np.degrees(belief[12]))
+    assert 0.8 < value["acc.z"] < 1.2  # g
+    assert abs(value["stateEstimate.az"]) < 0.2  # g, gravity taken off
+    assert 8000 < value["stateEstimateZ.az"] < 12000  # mm/s², gravity left in
+    assert value["stabilizer.pitch"] * value["stateEstimate.vx"] < 0 or value["stateEstimate.vx"] < 0.05
+    assert value["stateEstimate.yaw"] == pytest.approx(np.degrees(2 * np.arctan2(belief[8], belief[9])), abs=2)
+    assert 30000 < value["motor.m1"] < 60000
+    assert value["pm.vbat"] < 4.05  # it sags under load
+    assert value["ctrltarget.mode_x"] == 1
 
 
 def test_the_battery_empties_in_flight_and_not_on_the_floor(hovering):

@@ -15,7 +15,6 @@ from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import PAPER
 from cfplan.vehicle.timing import duration_of
-from studies.paper import sequences as paper_sequences
 from studies.paper.networks import Kind, Size, build_network
 from studies.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
 from studies.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
@@ -150,12 +149,9 @@ def test_paths_that_are_solved_again_have_labels_of_their_own(sequences, tmp_pat
     assert any(not torch.equal(*pair) for pair in zip(*(end.state_dict().values() for end in ends), strict=True))
 
 
-def test_a_perturbed_path_that_cannot_be_solved_keeps_the_clean_label(sequences, monkeypatch):
-    def refuse(spec, number, path):
-        raise InputError("too few nodes", hint="take more")
-
-    monkeypatch.setattr(paper_sequences, "solve", refuse)
-    noisy = sequences.perturbed_by(0.05, np.random.SeedSequence(3), Relabel.SOLVE)
+def test_a_perturbed_path_that_cannot_be_solved_keeps_the_clean_label(sequences):
+    too_few = replace(sequences, spec=replace(sequences.spec, nodes=4))
+    noisy = too_few.perturbed_by(0.05, np.random.SeedSequence(3), Relabel.SOLVE)
     assert np.array_equal(noisy.answers, sequences.answers)
 
 
