@@ -90,8 +90,9 @@ def read(file: Path) -> MocapLog:
     row = _FIRST_ROW.search(data)
     begin = row.start() if row else len(data)
     lines = [line for line in data[:begin].decode("utf-8", errors="replace").splitlines() if line.strip(' \t,;"')]
+    lines = lines or [""]
     first = data[begin : data.find(b"\n", begin) + 1 or len(data)].decode("utf-8", errors="replace").strip("\r\n")
-    sample = first or (lines or [""])[-1]
+    sample = first or lines[-1]
     delimiter = max("\t;,", key=sample.count)
     if delimiter not in sample or (delimiter == "," and re.search(r"\d,\d+ +[-\d]", first)):  # or decimal commas
         delimiter = " "
@@ -99,12 +100,7 @@ def read(file: Path) -> MocapLog:
         data = data[:begin] + b"\n".join(b" ".join(line.split()) for line in data[begin:].splitlines())
         first = " ".join(first.split())
     where, cells = f"{file}:{max(line_at(data, begin) - 1, 1)}", first.split(delimiter)
-    if (lines or [""])[0].startswith("Format Version,"):
-        head = _motive(lines, where)
-    elif (lines or [""])[0].startswith(("FILE_VERSION\t", "NO_OF_FRAMES\t")):
-        head = _qtm(lines, len(cells), where)
-    else:
-        head = _named((lines or [""])[-1], cells, delimiter, where)
+    head = _head(lines, cells, delimiter, where)
     if not row:
         raise InputError("no rows of numbers below the header", where=where, hint="export the log again")
     wanted = {head.time, *(column for columns in head.subjects.values() for column, _ in columns.values())} - {-1}
@@ -123,6 +119,14 @@ def read(file: Path) -> MocapLog:
     return MocapLog(head.format, subjects, tuple(notes), truncated=cut)
 
 
+def _head(lines: Sequence[str], row: Sequence[str], delimiter: str, where: str) -> _Head:
+    if lines[0].startswith("Format Version,"):
+        return _motive(lines, where)
+    if lines[0].startswith(("FILE_VERSION\t", "NO_OF_FRAMES\t")):
+        return _qtm(lines, len(row), where)
+    return _named(lines[-1], row, delimiter, where)
+
+
 def _named(line: str, row: Sequence[str], delimiter: str, where: str) -> _Head:
     """Return the columns that the line names; or those of a file whose columns are not named."""
     text = line.strip().lstrip("#").strip()
@@ -132,19 +136,20 @@ def _named(line: str, row: Sequence[str], delimiter: str, where: str) -> _Head:
     if (not text or line.lstrip().startswith("#")) and not set(TIMES) & set(names) and len(row) in _UNNAMED:
         names = _UNNAMED[len(row)]
         units, notes = ("",) * len(names), (f"no line names the columns: taken as {', '.join(names)}",)
-    if unknown := [unit for unit in units if unit and unit not in UNITS and set(units) & set(UNITS)]:
-        raise InputError(f"the unit {unknown[0]!r} is unknown", where=where, hint=f"known: {', '.join(UNITS)}")
     times = [name for name in TIMES if name in names]
     for form, (unit, layout) in LAYOUTS.items():
-        subjects = {}
+        subjects, used = {}, {names.index(name) for name in times[:1]}
         for subject_name, columns in layout.items():
             found = {c: (names.index(key), k) for c, (key, k) in columns.items() if key in names}
             if found.keys() >= set(PLACE):
                 subjects[subject_name] = {c: (i, k * UNITS.get(units[i], 1.0)) for c, (i, k) in found.items()}
+                used |= {column for column, _ in found.values()}
                 missing = [columns[c][0] for c in QUATERNION if c in columns and c not in found]
                 if form != "cfclient log" and 0 < len(missing) < len(QUATERNION):
                     raise InputError(f"there is no column {', '.join(missing)}", where=where, hint=_HINT)
         if subjects and times:
+            if unknown := [units[column] for column in used if units[column] and units[column] not in UNITS]:
+                raise InputError(f"the unit {unknown[0]!r} is unknown", where=where, hint=f"known: {', '.join(UNITS)}")
             time = names.index(times[0])
             return _Head(form, subjects, time, UNITS.get(units[time], unit), notes=notes)
     missing = [name for name in PLACE if name not in names] + ["t"] * (not times)

@@ -51,8 +51,8 @@ READ = {  # name: format, content; a body at (1, 2, 3), turned by 90° to the le
     "TUM": ("TUM trajectory", lines(
         "# ground truth", "# timestamp tx ty tz qx qy qz qw", "17.00  1 2 3 0 0 ~ ~", "17.01  1 2 3 0 0 ~ ~")),
     "EuRoC": ("EuRoC ground truth", lines(
-        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []",
-        "0,1,2,3,~,0,0,~", "10000000,1,2,3,~,0,0,~")),
+        "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v [m s^-1]",
+        "0,1,2,3,~,0,0,~,9", "10000000,1,2,3,~,0,0,~,9")),
     "cfclient": ("cfclient log", lines(
         ",".join(["Timestamp", *(f"stateEstimate.{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw"))]),
         "5120,1.0,2.0,3.0,0.0,-0.0,90.0", "5130,1.0,2.0,3.0,0.0,0.0,90.0")),
