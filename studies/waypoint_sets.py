@@ -1,17 +1,23 @@
-"""Sets of waypoints of many kinds, from a seed, and tracks with published coordinates."""
+"""Sets of waypoints of many kinds, from a seed, rooms with obstacles, and tracks with published coordinates."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cfplan.geometry.min_snap import spaced
 from cfplan.geometry.random_paths import generator
+from cfplan.safety.space import SIDES, Box, Cylinder, Obstacle, Space
 
 ROOM = np.array([[-2.0, -3.5, 0.3], [2.0, 3.5, 1.7]])  # m, low and high corner of the waypoints in the shipped room
 HALL = np.array([[-4.8, -4.8, 0.3], [4.8, 4.8, 4.7]])  # m, likewise in a hall of 10 × 10 × 5 m
 COUNTS = (3, 15)  # of waypoints
+GRAZED = 0.05  # m
+_CLEAR = 0.1  # m, between waypoints and the margins of walls and obstacles
 
 Random = np.random.Generator
 
@@ -131,3 +137,52 @@ TRACKS: Mapping[str, NDArray] = MappingProxyType(
 )  # fmt: skip
 """Waypoints, (K, 3) m: gates of lsy_drone_racing (level0.toml, from above its drone's place on, with an end added), and
 of rpg_time_optimal (track.yaml; Foehn et al., "Time-optimal planning for quadrotor waypoint flight", 2021)."""
+
+
+def furnished_room(seed: int, room: Space) -> tuple[Space, NDArray]:
+    """Return a room with 1 to 8 boxes and poles, and 2 to 6 clear waypoints, (K, 3) m, that these stand between.
+
+    At least one straight line between waypoints is blocked, or passes an obstacle's margin by less than GRAZED.
+    """
+    random = generator(seed)
+    low, high = np.array(room.low) + room.margin, np.array(room.high) - room.margin
+    while True:
+        furnished = replace(room, obstacles=tuple(_obstacle(random, low, high) for _ in range(random.integers(1, 9))))
+        points = random.uniform(low + _CLEAR, high - _CLEAR, (100, 3))
+        points = points[furnished.nearest(points)[0] < -_CLEAR]
+        points = points[: random.integers(2, 7)]
+        if len(points) < 2 or np.linalg.norm(np.diff(points, axis=0), axis=1).min() < 0.5:
+            continue
+        lines = np.concatenate([np.linspace(a, b, 200) for a, b in pairwise(points)])
+        if furnished.beyond(lines)[:, SIDES:].max() > -GRAZED:
+            return furnished, points
+
+
+def _obstacle(random: Random, low: NDArray, high: NDArray) -> Obstacle:
+    x, y = random.uniform(low[:2], high[:2]).tolist()
+    if random.random() < 0.5:
+        return Cylinder(x, y, random.uniform(0.03, 0.25), 0.0, random.uniform(0.6, 2.0))
+    a, b, top = random.uniform(0.1, 0.5), random.uniform(0.1, 0.5), random.uniform(0.3, 2.0)
+    return Box((x - a, y - b, 0.0), (x + a, y + b, top), random.uniform(0.0, np.pi))
+
+
+def clearance(position: NDArray, obstacles: tuple[Obstacle, ...]) -> float:
+    """Return the least distance, m, between positions, (N, 3) m, and obstacles; 0 in one.
+
+    It is computed apart from the space's own, as positions less the nearest places of the obstacles.
+    """
+    least = np.inf
+    for each in obstacles:
+        if isinstance(each, Cylinder):
+            flat = position[:, :2] - [each.x, each.y]
+            radius = np.linalg.norm(flat, axis=1, keepdims=True)
+            nearest = flat * np.minimum(1.0, each.radius / np.maximum(radius, 1e-12))
+            away = np.column_stack([flat - nearest, position[:, 2] - np.clip(position[:, 2], each.low, each.high)])
+        else:
+            middle = (np.array(each.low) + each.high) / 2.0
+            turn = Rotation.from_euler("z", each.yaw)
+            own = turn.inv().apply(position - middle)
+            half = (np.array(each.high) - each.low) / 2.0
+            away = own - np.clip(own, -half, half)
+        least = min(least, float(np.linalg.norm(away, axis=1).min()))
+    return least

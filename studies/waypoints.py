@@ -1,8 +1,10 @@
 """Choose paths through sets of waypoints, and compare their flights with min-snap and with a point mass.
 
 The sets are of many kinds, in the shipped room or in a larger hall. Each is also flown in a tight room, whose walls
-leave 0.15 m around the box of the waypoints, and with every waypoint passed within a distance. Tracks with published
-coordinates are flown in a space around them.
+leave 0.15 m around the box of the waypoints, and with every waypoint passed within a distance. Other rooms have
+obstacles between the waypoints; there, plans also give way for link loss and stops, as flights do. Tracks with
+published coordinates
+are flown in a space around them.
 """
 
 import math
@@ -22,16 +24,17 @@ from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planning.path.choice import FastestPath, fastest_path
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
+from cfplan.preparation.plan_flight import give_way
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
 from studies.runner.limits import limits_for
 from studies.runner.options import option
-from studies.runner.reductions import among, count, largest, mean, quantile
+from studies.runner.reductions import among, count, largest, mean, quantile, smallest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
-from studies.waypoint_sets import HALL, KINDS, TRACKS, waypoint_set
+from studies.waypoint_sets import HALL, KINDS, TRACKS, clearance, furnished_room, waypoint_set
 
-SETS, TIGHT, WITHIN, TRACK = "sets", "tight", "within", "track"
+SETS, TIGHT, WITHIN, FURNISHED, TRACK = "sets", "tight", "within", "furnished", "track"
 WAYS = (SETS, TIGHT, WITHIN)
 _NAMES = {SETS: "exactly, in their rooms", TIGHT: "in tight rooms", WITHIN: "within a distance"}
 AROUND = 0.35  # m between the box of the waypoints and the walls of a tight room
@@ -48,6 +51,7 @@ class Settings:
 
     sets: int = option(400, "Number of sets of waypoints.", least=1)
     first_seed: int = option(0, "Seed of the first set.", least=0)
+    rooms: int = option(200, "Number of rooms with obstacles.", least=0)
     distance: float = option(0.1, "Distance within which waypoints are passed, m.", least=0.0)
 
 
@@ -65,6 +69,9 @@ class ChosenFlight:
     seconds: float  # to choose the path and certify it
     certified: bool
     refused: str  # why it is not flown; empty if it is
+    obstacles: int = 0
+    clearance: float = math.nan  # m, between the flight and the obstacles
+    lost: str = ""  # why link loss does not let it be flown; empty if it does
 
     @property
     def over(self) -> float:
@@ -87,6 +94,8 @@ def work(settings: Settings, run: Run) -> Work:
     limits = limits_for(Path())
     seeds = range(settings.first_seed, settings.first_seed + settings.sets)
     cases: dict[str, tuple[str, int | str]] = {f"{how} {seed}": (how, seed) for how in WAYS for seed in seeds}
+    rooms = range(settings.first_seed, settings.first_seed + settings.rooms)
+    cases |= {f"{FURNISHED} {seed}": (FURNISHED, seed) for seed in rooms}
     cases |= {name: (TRACK, name) for name in TRACKS}
     _fly(path_through(TRACKS["lawn mower"]), limits)  # so that no case waits for compiling
     return Work(cases, partial(measure, limits=limits, distance=settings.distance), ChosenFlight)
@@ -95,6 +104,8 @@ def work(settings: Settings, run: Run) -> Work:
 def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> ChosenFlight:
     """Choose the path of a case, certify the flight along it, and compare."""
     how, which = case
+    if how == FURNISHED:
+        return _measure_furnished(int(which), limits)
     kind, points = (str(which), TRACKS[str(which)]) if how == TRACK else waypoint_set(int(which))
     path_file = path_through(points)
     if how == WITHIN:
@@ -117,6 +128,29 @@ def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> Cho
         chosen.min_snap if chosen and chosen.min_snap < math.inf else math.nan,
         math.nan if point_mass is None else point_mass, excursion, seconds,
         planned is not None and planned.certificate.passed, refused,
+    )  # fmt: skip
+
+
+def _measure_furnished(seed: int, limits: Limits) -> ChosenFlight:
+    """Plan a flight among obstacles, and let it give way for link loss and stops; measure how near it comes to them."""
+    space, points = furnished_room(seed, limits.space)
+    begun = time.perf_counter()
+    planned, refused, least, lost = None, "", math.nan, ""
+    try:
+        planned, _ = _fly(path_through(points), replace(limits, space=space))
+    except CfplanError as error:
+        refused = error.what
+    seconds = time.perf_counter() - begun
+    if planned:
+        times = np.arange(0.0, planned.trajectory.duration, 1e-3)
+        least = clearance(planned.trajectory.at(times).position, space.obstacles)
+        try:
+            give_way(planned)
+        except CfplanError as error:
+            lost = error.what
+    return ChosenFlight(
+        FURNISHED, "", len(points), planned.trajectory.duration if planned else math.nan, math.nan, math.nan, math.nan,
+        seconds, planned is not None and planned.certificate.passed, refused, len(space.obstacles), least, lost,
     )  # fmt: skip
 
 
@@ -164,6 +198,17 @@ TIME_COLUMNS = (
     Column("p99", "p99", "s", ".2f", value=among("few", quantile("seconds", 0.99))),
     Column("longest", "longest of all", "s", ".2f", value=largest("seconds")),
 )
+FURNISHED_COLUMNS = (
+    Column("obstacles", "obstacles"),
+    Column("rooms", "rooms", value=count()),
+    Column("flown", "certified", of="rooms", value=count("certified")),
+    Column("comes_down", "link loss ends clear", of="rooms",
+           value=count(lambda row: row.certified and not row.lost)),
+    Column("clearance", "least distance", "m", ".3f", meaning="between flights and obstacles; plans keep 0.2 m",
+           value=smallest("clearance")),
+    Column("median", "to choose and certify, median", "s", ".2f", value=quantile("seconds", 0.5)),
+    Column("longest", "longest", "s", ".2f", value=largest("seconds")),
+)  # fmt: skip
 TRACK_COLUMNS = (
     Column("kind", "track"),
     Column("waypoints", "waypoints"),
@@ -176,7 +221,7 @@ TRACK_COLUMNS = (
 
 def tables(settings: Settings, rows: list[ChosenFlight]) -> Iterator[Table]:
     """Yield the sets, their flights in tight rooms and within a distance, the time of choosing, and the tracks."""
-    by_way = {how: [row for row in rows if row.how == how] for how in (*WAYS, TRACK)}
+    by_way = {how: [row for row in rows if row.how == how] for how in (*WAYS, FURNISHED, TRACK)}
     yield table("sets", "Chosen paths through sets of waypoints", COLUMNS, by_way[SETS], by=("kind",), last="all")
     exact = {(row.kind, place): row for place, row in enumerate(by_way[SETS])}
     gains = [
@@ -189,6 +234,11 @@ def tables(settings: Settings, rows: list[ChosenFlight]) -> Iterator[Table]:
     yield table("tight", f"In rooms {AROUND:g} m around the waypoints", _PATHS, by_way[TIGHT], by=("kind",), last="all")
     sets = [replace(row, how=_NAMES[row.how]) for row in rows if row.how in _NAMES]
     yield table("seconds", "Time to choose a path and certify its flight", TIME_COLUMNS, sets, by=("how",))
+    yield table("furnished", "In rooms with obstacles between the waypoints", FURNISHED_COLUMNS, by_way[FURNISHED],
+                by=("obstacles",), last="all")  # fmt: skip
+    refused = [row for row in by_way[FURNISHED] if row.refused or not row.certified]
+    yield table("refused", "Rooms in which no flight was found", (Column("obstacles", "obstacles"),
+                Column("refused", "refused, as")), refused)  # fmt: skip
     yield table("tracks", "Tracks with published coordinates", TRACK_COLUMNS, by_way[TRACK])
 
 

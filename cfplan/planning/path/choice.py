@@ -28,11 +28,12 @@ from cfplan.geometry.waypoints import Gate
 from cfplan.planners.expert.sensitivity import sensitivity
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.path.descent import Cost, descend
+from cfplan.planning.path.detour import with_corners
 from cfplan.planning.path.room import Room
 from cfplan.planning.path.variables import ChoiceVariables, Knots, variables_of, with_points_between
 from cfplan.planning.plan import default_budget, plan
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import distances_beyond, inside
 
 CHOOSING = 0.5  # of the budget of planning
 CERTIFYING = 0.2  # of the time for choosing, kept for certifying what was found
@@ -43,6 +44,7 @@ TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps impr
 WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
 RESERVE = 0.002  # m, that is kept inside besides what was missed
 ROUGHLY = 0.01  # share by which steps improve a first descent at last
+SAMPLES = 33  # of each piece, where a corridor is checked
 STILL = 1e-3  # of the nominal speed, below which a path stands still
 FORWARDS = 0.2  # of the nominal speed of 1 m/s, at which gates are passed forwards at least
 
@@ -103,14 +105,13 @@ def fastest_path(
         return math.inf
 
     points = path_file.waypoints
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    timings = [times * (lengths.sum() / times.sum()) for times in (lengths, centripetal_times(points))]
-    paths = [_least_snap(Knots(times, points, np.arange(len(points)))) for times in timings]
+    paths = [_least_snap(knots) for knots in _timed(points, np.arange(len(points)))]
     searching = deadline.earlier(CERTIFYING * deadline.left) if deadline.left < math.inf else NEVER
-    found, finished = _search(path_file, limits, timings, searching)
+    found, finished = _search(path_file, limits, searching)
     durations = [certified(path) for path in (found, *paths)]
-    exactly = path_file.corridor is None and not any(isinstance(each, Gate) for each in path_file.regions)
-    best = int(np.argmin(durations)) if exactly else 0  # the first of equal ones
+    plain = path_file.corridor is None and not limits.space.obstacles
+    plain = plain and not any(isinstance(each, Gate) for each in path_file.regions)
+    best = int(np.argmin(durations)) if plain else 0  # the first of equal ones
     least_snap = paths[0] if durations[1] < durations[2] else paths[1]
     return FastestPath((found, *paths)[best], durations[best], min(durations[1:]), least_snap, finished)
 
@@ -129,14 +130,36 @@ def _check_gates(path_file: PathFile, limits: Limits) -> None:
             )
 
 
+def _timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
+    """Return points with times like their straight lengths, and with centripetal ones; `waypoint` of them are such."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    centripetal = centripetal_times(points)
+    return Knots(lengths, points, waypoint), Knots(centripetal * (lengths.sum() / centripetal.sum()), points, waypoint)
+
+
 def _least_snap(knots: Knots) -> Path:
     return least_snap(knots.points, knots.times)
 
 
-def _search(path_file: PathFile, limits: Limits, timings: list[NDArray], deadline: Deadline) -> tuple[Path, bool]:
-    """Return the best path that descent finds from the better of some timings, and whether it ended in time."""
+def _search(path_file: PathFile, limits: Limits, deadline: Deadline) -> tuple[Path, bool]:
+    """Return the best path that descent finds, and whether it ended in time.
+
+    Where link loss must end clear of obstacles, it is sought where that is likely; and elsewhere if there is none.
+    """
     room = Room(limits.space, path_file.waypoints, path_file.corridor)
-    starts = [_started(path_file, times) for times in timings]
+    rooms = [room]
+    if limits.space.obstacles and not limits.link_loss.only_warn:
+        rooms = [room.to_come_down(), room]
+    for each in rooms:
+        found, stays, finished = _search_in(each, path_file, limits, deadline)
+        if stays or not finished:
+            break
+    return found, finished
+
+
+def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> tuple[Path, bool, bool]:
+    """Return the best path from the better of two timings, whether it stays inside, and whether the search ended."""
+    starts = [_started(path_file, knots) for knots in _timed(*with_corners(path_file.waypoints, room.space))]
     costs = []
     for start in starts:
         variables = variables_of(start, path_file.regions, path_file.laps, limits.space.margin)
@@ -146,7 +169,8 @@ def _search(path_file: PathFile, limits: Limits, timings: list[NDArray], deadlin
     if not inside(cost.missed(x)):
         x, _ = _descend_inside(cost, cost.by_length, x, ROUGHLY, deadline)
     x, finished = _descend_inside(cost, cost, x, TOLERANCE, deadline)
-    return _least_snap(cost.variables.knots(x if cost.best is None else cost.best)), finished
+    stays = cost.best is not None
+    return _least_snap(cost.variables.knots(x if cost.best is None else cost.best)), stays, finished
 
 
 def _descend_inside(
@@ -165,9 +189,9 @@ def _descend_inside(
     return x, descent.finished
 
 
-def _started(path_file: PathFile, times: NDArray) -> Knots:
-    """Return where a search starts: at the waypoints with a point between each two, which leads into gates forwards."""
-    knots = with_points_between(path_file.waypoints, times)
+def _started(path_file: PathFile, knots: Knots) -> Knots:
+    """Return where a search starts: with a point between each two, which leads into gates forwards."""
+    knots = with_points_between(knots)
     for point, region in zip(knots.waypoint, path_file.regions, strict=True):
         if isinstance(region, Gate):
             for beside, side in ((point - 1, -1.0), (point + 1, 1.0)):
@@ -282,7 +306,10 @@ class _Cost:
         """Return how far, m, the path leaves the room, between samples too; negative inside."""
         knots = self.variables.knots(x)
         path = _least_snap(knots)
-        s = np.linspace(path.breaks[:-1], path.breaks[1:], 33, axis=1)
-        bend = np.linalg.norm(path(s, 2), axis=-1).max(axis=1) * (np.diff(path.breaks) / 32) ** 2 / 8
-        beyond = self.room.beyond(path(s.ravel()), self._leg(knots, s.ravel())).max(axis=1)
-        return float((beyond.reshape(s.shape) + bend[:, None]).max())
+        _, beyond = distances_beyond(path, self.room.space)
+        if self.room.corridor is None:
+            return float(beyond.max())
+        s = np.linspace(path.breaks[:-1], path.breaks[1:], SAMPLES, axis=1)
+        bend = np.linalg.norm(path(s, 2), axis=-1).max(axis=1) * (np.diff(path.breaks) / (SAMPLES - 1)) ** 2 / 8
+        aside = self.room.aside(path(s.ravel()), self._leg(knots, s.ravel())).reshape(s.shape)
+        return float(max(beyond.max(), (aside + bend[:, None]).max()))

@@ -105,10 +105,10 @@ def variables_of(knots: Knots, regions: tuple[Region, ...], laps: int, margin: f
     return ChoiceVariables(knots, axes, bounded, np.arange(len(knots.times)) % of_lap, point_of, np.flatnonzero(moves))
 
 
-def with_points_between(waypoints: NDArray, times: NDArray) -> Knots:
-    """Return waypoints, (K, 3) m, with a point between each two, where the path of least snap is half-way in time."""
-    path = least_snap(waypoints, times)
-    breaks = np.concatenate([[0.0], np.cumsum(times)])
-    points = np.empty((2 * len(waypoints) - 1, 3))
-    points[::2], points[1::2] = waypoints, path((breaks[:-1] + breaks[1:]) / 2)
-    return Knots(np.repeat(times / 2, 2), points, np.arange(0, len(points), 2))
+def with_points_between(knots: Knots) -> Knots:
+    """Return knots with one more between each two, where the path of least snap is half-way in time."""
+    path = least_snap(knots.points, knots.times)
+    breaks = np.concatenate([[0.0], np.cumsum(knots.times)])
+    points = np.empty((2 * len(knots.points) - 1, 3))
+    points[::2], points[1::2] = knots.points, path((breaks[:-1] + breaks[1:]) / 2)
+    return Knots(np.repeat(knots.times / 2, 2), points, 2 * knots.waypoint)
