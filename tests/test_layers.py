@@ -4,6 +4,8 @@ Studies import cfplan, and are imported by nothing but tests.
 """
 
 import ast
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -104,6 +106,51 @@ def test_a_file_imports_other_rooms_by_their_face(file):
 def test_cfplan_imports_neither_studies_nor_tests():
     for file in FILES:
         assert not {name[0] for name in names(file)} & {"studies", *TESTS}, f"{file} needs a checkout"
+
+
+def defined(files: Iterable[Path]) -> set[str]:
+    """Return the names that files define or assign, attributes of self included."""
+    found = set()
+    for node in (each for file in files for each in nodes(file)):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            found.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
+            found.add(node.attr)
+    return found
+
+
+def patched(call: ast.Call) -> list[str]:
+    """Return the name that a call patches, if it does."""
+    if not ast.unparse(call.func).endswith(("setattr", "patch", "patch.object")):
+        return []
+    return [each.value.split(".")[-1] for each in call.args if isinstance(getattr(each, "value", None), str)]
+
+
+def used(program: ast.AST) -> Iterator[str]:
+    """Yield the attributes, imports and patched names of a program, and of programs that it has as strings."""
+    for node in ast.walk(program):
+        if isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, ast.ImportFrom):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.Call):
+            yield from patched(node)
+        elif isinstance(node, ast.Constant) and "import " in str(node.value):
+            with suppress(SyntaxError):
+                yield from used(ast.parse(node.value))
+
+
+def test_tests_use_no_private_names_and_patch_no_constants():
+    """Promises are held through what modules offer, so that all that is behind may change."""
+    ours = defined(FILES + STUDY_FILES)
+    private = {name for name in ours if name.startswith("_") and not name.endswith("__")}
+    constants = {name for name in ours if name.isupper()}
+    for file in Path(__file__).parent.rglob("*.py"):
+        assert not {*used(tree(file))} & (private - defined([file])), f"{file} uses private names"
+        calls = [node for node in nodes(file) if isinstance(node, ast.Call)]
+        assert not {name for call in calls for name in patched(call)} & constants, f"{file} patches constants"
 
 
 def test_studies_import_no_tests_and_their_runner_imports_no_study():

@@ -65,7 +65,7 @@ def test_a_flow_deck_is_a_parameter_that_says_so():
 
 
 def test_no_vehicle_has_a_flow_deck_and_its_poses_by_radio_alone():
-    ended = CliRunner().invoke(virtual, ["--flow-deck", "--vicon", "8010", "--safety", str(SAFETY)])
+    ended = CliRunner().invoke(virtual, ["--flow-deck", "--vicon", "8010", "--safety", str(SAFETY), "--seconds", "0.1"])
     assert isinstance(ended.exception, InputError)
     assert "no flow deck" in str(ended.exception)
 

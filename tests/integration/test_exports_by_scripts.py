@@ -66,7 +66,7 @@ class Script:
         self.cf = cf = SimpleNamespace(
             send_packet=lambda packet, **_: self._to_send.append(packet), disconnected=Caller(), link=self._link,
             platform=SimpleNamespace(get_protocol_version=lambda: self.lab.vehicle.settings.protocol),
-            add_port_callback=lambda port, note: self._link._callbacks.setdefault(port, []).append(note),
+            add_port_callback=self._link.add_port_callback,
         )  # fmt: skip
         cf.high_level_commander, cf.loc, cf.mem = HighLevelCommander(cf), Localization(cf), Memory(cf)
         self._poses = SteppedPoses(self.lab, LIMITS.pose)

@@ -453,8 +453,9 @@ def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monk
         made = plan_request(held, request, first, limits, part, attempt)
         if len(ahead) == 1:
             planner.clock.sleep(LONG)
-            searched = attempt.ways.searched  # by this computer's clock; once a way is known nobody searches
-            needed.append(LONG - searched if what == "plan" else LONG + made.plan.seconds - searched)
+            # By this computer's clock planning takes time too; once a way is known nobody searches for it again.
+            searched = attempt.ways.searched if what == "plan" else 0.0
+            needed.extend((LONG - searched, LONG + made.plan.seconds))
             if what == "plan":
                 raise TooLateError("the plan was not made in time")
         return made
@@ -462,7 +463,8 @@ def test_who_came_late_plans_as_far_ahead_as_plan_or_checks_took(in_flight, monk
     monkeypatch.setattr(planner_worker, "plan_request", takes_long_once)
     answer = planner.ask(Wish.REPLACE, FAR)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
-    assert ahead[1] - ahead[0] == pytest.approx(needed[0] * RATE, abs=2)
+    least, most = needed
+    assert least * RATE - 2 <= ahead[1] - ahead[0] <= most * RATE + 2
     assert (others[1] - others[0] > LONG * RATE) is (what == "checks")  # other joints must leave time for these too
 
 

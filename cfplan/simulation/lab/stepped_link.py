@@ -48,10 +48,14 @@ class SteppedLink(Link):
                 latency=SimpleNamespace(latency=_ROUND_TRIP_MS),
                 latency_updated=SimpleNamespace(add_callback=lambda _: None),  # the radio reports acknowledgements
             ),
-            add_port_callback=lambda port, note: self._callbacks.setdefault(port, []).append(note),
+            add_port_callback=self.add_port_callback,
         )
         super().__init__(endpoint, URI, report, clock=lab.clock)
         lab.radio.acknowledged = self.note_acknowledgement
+
+    def add_port_callback(self, port: int, note: Callable[[Any], None]) -> None:
+        """Call `note` with each packet that comes from a port, as cflib does."""
+        self._callbacks.setdefault(port, []).append(note)
 
     def send_soon(self, packet: Any) -> None:
         """Send a packet as the radio's driver does: wait briefly for its queue, then drop the packet."""

@@ -55,17 +55,32 @@ def dongle():
     return Dongle()
 
 
+class CflibDriver:
+    """cflib's driver of a dongle that is there already."""
+
+    needs_resending = False
+
+    def __init__(self, dongle: Dongle):
+        self.out_queue = queue.Queue(1)
+        self._thread = _RadioDriverThread(
+            dongle, queue.Queue(), self.out_queue, lambda _: None, lambda _: None, self, None
+        )
+        self._thread._radio_link_statistics = SimpleNamespace(update=lambda *_: None)
+        self.start, self.stop = self._thread.start, self._thread.stop
+
+
 @pytest.fixture
-def driver(dongle):
-    driver = SimpleNamespace(out_queue=queue.Queue(1), needs_resending=False)
-    driver._thread = _RadioDriverThread(
-        dongle, queue.Queue(), driver.out_queue, lambda _: None, lambda _: None, driver, None
-    )
-    driver._thread._radio_link_statistics = SimpleNamespace(update=lambda *_: None)
+def cflibs_driver(dongle):
+    driver = CflibDriver(dongle)
     empty_air(driver, lambda: dongle.now)
-    driver._thread.start()
-    yield SerializedDriver(driver, SimpleNamespace(now=lambda: dongle.now))
-    driver._thread.stop()
+    driver.start()
+    yield driver
+    driver.stop()
+
+
+@pytest.fixture
+def driver(cflibs_driver, dongle):
+    return SerializedDriver(cflibs_driver, SimpleNamespace(now=lambda: dongle.now))
 
 
 def wait(dongle, seconds: float) -> None:
@@ -101,9 +116,11 @@ def test_what_a_dead_radio_held_does_not_come_when_it_returns(dongle, driver):
     assert held >= 40 - KEEPS_FOR / 0.01 - 1
 
 
-def test_a_ping_of_cflibs_own_is_dropped_by_a_radio_that_is_dead_for_long_and_ends_no_link(dongle, driver):
+def test_a_ping_of_cflibs_own_is_dropped_by_a_radio_that_is_dead_for_long_and_ends_no_link(
+    dongle, driver, cflibs_driver
+):
     ended = []
-    driver._driver.link_error_callback = ended.append
+    cflibs_driver.link_error_callback = ended.append
     dongle.dead = True
     driver.send_soon(packet(9, 1, b"\x04"))
     wait(dongle, 0.05)
