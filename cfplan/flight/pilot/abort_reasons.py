@@ -91,7 +91,7 @@ class AbortReason(Enum):
     )
     BEYOND_FENCE = (
         "{value:.2f} m beyond the fence",
-        "The fence is the space less its margin, without the floor; `flight.fence` says how far beyond it the vehicle "
+        "The fence is the space less its margin, without the floor, and the obstacles; `flight.fence` says how far beyond it the vehicle "
         "brakes, lands and is cut.",
         "replay the record: did the deviation grow, or is `space` in safety.yaml smaller than the room?",
     )
