@@ -11,6 +11,7 @@ from stepped_flight import fly_stepped
 
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.preflight import check_plan_inside, check_start_place, check_way_to_start
@@ -220,6 +221,28 @@ def test_sinking_blindly_does_not_lead_off_a_wall_at_an_obstacle(limits):
     assert free < -0.1
     in_the_way = furnished(limits, Box((0.5, -0.5, 0.0), (1.6, 0.5, 0.4)))
     assert off_walls(beside, in_the_way.space) == (0.0, 0.0)
+
+
+def test_a_fall_comes_as_near_to_an_obstacle_as_its_curve(limits):
+    """Motors off at once, or with the longest lag; without errors the curve is p + v t - g t² / 2 + what is left."""
+    lost = replace(limits.link_loss, attitude_error=0.0, vertical_acceleration_error=0.0, velocity_error=0.0)
+    here = replace(furnished(limits, POLE), link_loss=lost)
+    random = np.random.default_rng(3)
+    states = np.zeros((200, 3, 3))
+    states[:, 0] = random.uniform((-1.5, -1.5, 0.5), (1.5, 1.5, 1.5), (200, 3))
+    states[:, 1] = random.uniform(-1.5, 1.5, (200, 3))
+    found, time = falls_from(states, here, 0.0), np.linspace(0.0, 1.5, 1501)[:, None]
+    by_pole = 0
+    for state, beyond, face in zip(states, found.beyond, found.face, strict=True):
+        curve = state[0] + time * state[1] - 0.5 * 9.81 * time**2 * [0.0, 0.0, 1.0]
+        nearest = from_pole(curve[curve[:, 2] > 0.0]).min()
+        assert beyond >= -nearest - 0.01
+        by_pole += face >= SIDES
+    assert by_pole > 50
+    still = np.zeros((1, 3, 3))
+    still[0, 0] = 0.5, 0.0, 1.0
+    assert falls_from(still, here, 0.0).beyond[0] == pytest.approx(-0.4, abs=1e-6)
+    assert falls_from(still, here, 0.05).beyond[0] == pytest.approx(-0.35, abs=1e-6)
 
 
 # In the air

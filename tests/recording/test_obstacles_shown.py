@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rerun as rr
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from mcap_protobuf.decoder import DecoderFactory
 
 from cfplan.errors import InputError
+from cfplan.flight.telemetry import Event, Level
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.figure import OBSTACLE, draw_plan
 from cfplan.planning.plan import plan
 from cfplan.recording.header import header_from_json, header_of_plan, header_to_json
-from cfplan.recording.public_topics import _scene
+from cfplan.recording.public_topics import SCENE, PublicTopics
 from cfplan.recording.rerun.record_view import log_room
 from cfplan.safety.space import Box, Cylinder, outline
 
@@ -60,8 +64,16 @@ def rgb(colour):
     return tuple(int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5))
 
 
-def test_foxglove_has_solids(header):
-    room = _scene(header).entities[0]
+def test_foxglove_has_solids(header, tmp_path):
+    with (tmp_path / "scene.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        PublicTopics(writer, header, lambda time: round(1e9 * time)).add(Event(1.0, Level.INFO, "begun"))
+        writer.finish()
+    with (tmp_path / "scene.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        scenes = [each.decoded_message for each in reader.iter_decoded_messages(topics=[SCENE])]
+    room = scenes[0].entities[0]
     (box,), (cylinder,) = room.cubes, room.cylinders
     assert (box.size.x, box.size.y, box.size.z) == pytest.approx((1.0, 1.0, 0.8))
     assert (cylinder.size.x, cylinder.size.z, cylinder.pose.position.z) == pytest.approx((0.2, 2.0, 1.0))
