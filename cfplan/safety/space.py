@@ -24,7 +24,7 @@ packets, and far above the rounding of sums and of a path's equations. A path dr
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
 _BLOCK = 16  # positions that follow one another, about which a box may tell enough
 _ROUND = 33  # points around a cylinder that is drawn
-_TOGETHER = 256  # positions, for which obstacles far from all of them are left out
+_AT_ONCE = 1 << 14  # distances between positions and obstacles that are computed at once, at most
 _PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
 _WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
 
@@ -123,9 +123,9 @@ class Space:
         most, face = room.max(axis=1), room.argmax(axis=1)
         if not self.obstacles:
             return most, face
-        prisms = _prisms(self.obstacles)
-        for begin in range(0, len(points), _TOGETHER):
-            some = slice(begin, begin + _TOGETHER)
+        prisms, together = _prisms(self.obstacles), max(_AT_ONCE // len(self.obstacles), 1)
+        for begin in range(0, len(points), together):
+            some = slice(begin, begin + together)
             near = _near(prisms, points[some], sizes[some])
             away = _distances(prisms.only(near), points[some, None], sizes[some, None])
             which = away.argmin(axis=1)

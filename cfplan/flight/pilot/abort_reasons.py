@@ -91,8 +91,8 @@ class AbortReason(Enum):
     )
     BEYOND_FENCE = (
         "{value:.2f} m beyond the fence",
-        "The fence is the space less its margin, without the floor; `flight.fence` says how far beyond it the vehicle "
-        "brakes, lands and is cut.",
+        "The fence is the space less its margin, without the floor, and without the obstacles and the margin about "
+        "them; `flight.fence` says how far beyond it the vehicle brakes, lands and is cut.",
         "replay the record: did the deviation grow, or is `space` in safety.yaml smaller than the room?",
     )
     DEVIATION = (

@@ -15,8 +15,9 @@ from cfplan.flight.on_board.pieces import Pieces, derivatives_of, goals_at
 from cfplan.flight.on_board.reference import PolynomialReference
 from cfplan.geometry.path_file import load_path_file, path_through
 from cfplan.planning.plan import plan
-from cfplan.safety.certificate import certify
+from cfplan.safety.certificate import OBSTACLES, certify
 from cfplan.safety.limits_file import load_limits
+from cfplan.safety.space import Cylinder
 from cfplan.simulation.on_board_run import on_board_run
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.measures import ANGULAR_ACCELERATION, BODY_RATE, MOTOR_THRUST, TILT
@@ -194,6 +195,20 @@ def test_pieces_that_are_too_fast_fail(made, limits):
     quick = Pieces(made.pieces.durations / 1.1, made.pieces.coefficients * 1.1 ** np.arange(8))
     certificate = certify_pieces(quick, limits.airframe, limits.plan, limits.space)
     assert not certificate.passed
+
+
+@pytest.mark.parametrize(("clear", "passed"), [(0.01, True), (-0.01, False)])
+def test_pieces_keep_the_margin_from_obstacles_or_fail(made, limits, clear, passed):
+    """A pole beside the way, its distance from it by a far finer grid."""
+    places = goals_at(made.pieces, np.linspace(0.0, made.pieces.duration, 50_001)).position
+    x, y = places[20_000, :2].tolist()
+    nearest = np.hypot(places[:, 0] - x - 0.5, places[:, 1] - y).min()
+    pole = Cylinder(x + 0.5, y, float(nearest) - limits.space.margin - clear, 0.0, 2.0)
+    space = replace(limits.space, obstacles=(pole,))
+    certificate = certify_pieces(made.pieces, limits.airframe, limits.plan, space)
+    found = next(each for each in certificate.margins if each.name == OBSTACLES)
+    assert found.passed == certificate.passed == passed
+    assert found.worst == pytest.approx(limits.space.margin + clear, abs=1e-3)
 
 
 def test_too_few_pieces_for_a_plan_are_refused_with_how_far_they_stray(limits):
