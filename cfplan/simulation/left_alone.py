@@ -181,7 +181,9 @@ def leave_alone(
         for n in range(first, first + count):
             for part in range(1, swept.shape[1]):
                 if swept[n, part, 0, 0] == np.inf:  # it was on the floor before
-                    swept[n, part] = swept[n, part - 1]
+                    for axis in range(3):
+                        swept[n, part, 0, axis] = swept[n, part - 1, 0, axis]
+                        swept[n, part, 1, axis] = swept[n, part - 1, 1, axis]
 
 
 @register_jitable(forceinline=True)
