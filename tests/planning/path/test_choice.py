@@ -17,7 +17,9 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planning.path.choice import chosen_path, fastest_path
 from cfplan.planning.plan import plan
-from cfplan.safety.space import check_space
+from cfplan.preparation.plan_flight import give_way
+from cfplan.safety.space import Box, Cylinder, check_space
+from studies.waypoint_sets import clearance
 from tests.geometry.test_path_file import CORNERS, SQUARE
 
 LAWN_MOWER = [
@@ -156,6 +158,49 @@ def test_gates_are_passed_through_forwards(yaw, limits):
 def test_a_gate_that_the_margin_fills_is_refused(limits):
     with pytest.raises(InfeasibleError, match=r"gate at waypoint 2 is 0.4 m wide.*0.2 m.*hint"):
         choose([[-1.5, 0, 1], [0, 0, 1], [1.5, 0, 1]], limits, regions=(None, Gate(0.0, 0.4, 1.0), None))
+
+
+TABLE = Box((-0.6, -0.5, 0.0), (0.6, 0.5, 0.8), name="table")
+POLE = Cylinder(0.0, 0.0, 0.1, 0.0, 2.0, "pole")
+
+
+@pytest.mark.parametrize("obstacles", [(TABLE,), (POLE,), (TABLE, Cylinder(1.2, 1.0, 0.1, 0.0, 2.0))])
+def test_obstacles_are_passed_beside_where_link_loss_must_end_clear_of_them(obstacles, limits):
+    """Over the table the way is shorter, and that is where it leads if nobody minds what falls on it."""
+    furnished = replace(limits, space=replace(limits.space, obstacles=obstacles))
+    points = [[-1.2, -2.0, 1.0], [0.9, 2.0, 1.2]]
+    path = choose(points, furnished).path
+    check_space(path, furnished.space)
+    assert clearance(path(np.linspace(0.0, path.end, 5000)), obstacles) > limits.space.margin - 1e-6
+    planned = plan(path, furnished.airframe, furnished)
+    give_way(planned)  # it raises where link loss ends on an obstacle at any speed
+    if TABLE in obstacles:
+        unminded = replace(furnished, link_loss=replace(furnished.link_loss, only_warn=True))
+        over = choose(points, unminded)
+        assert flight(over.path, unminded) < 0.98 * planned.trajectory.duration
+        with pytest.raises(InfeasibleError, match="table"):
+            give_way(plan(over.path, furnished.airframe, furnished))
+
+
+def test_a_wall_across_the_room_with_a_gap_is_passed_through_the_gap(limits):
+    """The straight way leads through the wall, and no descent from there finds the gap."""
+    wall = Box((-2.25, -0.1, 0.0), (1.0, 0.1, 2.0), name="partition")
+    furnished = replace(
+        limits, space=replace(limits.space, obstacles=(wall,)), link_loss=replace(limits.link_loss, only_warn=True)
+    )
+    chosen = choose([[-1.5, -2.0, 1.0], [-1.5, 2.0, 1.0]], furnished)
+    places = chosen.path(np.linspace(0.0, chosen.path.end, 5000))
+    assert clearance(places, (wall,)) > limits.space.margin - 1e-6
+    crossing = np.abs(places[:, 1]).argmin()
+    assert 1.2 - 1e-6 < places[crossing, 0] < 2.05 + 1e-6
+
+
+def test_where_obstacles_close_the_room_the_refusal_names_one(limits):
+    closed = Box((-2.25, -0.1, 0.0), (2.25, 0.1, 2.0), name="partition")
+    furnished = replace(limits, space=replace(limits.space, obstacles=(closed,)))
+    path = choose([[-1.5, -2.0, 1.0], [-1.5, 2.0, 1.0]], furnished).path
+    with pytest.raises(InfeasibleError, match="partition"):
+        plan(path, furnished.airframe, furnished)
 
 
 @pytest.mark.parametrize("points", [
