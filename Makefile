@@ -76,6 +76,11 @@ pictures: install
 	$(BIN)/cfplan replay build/pictures/figure8/* --gif docs/images/flight.gif --force
 	$(BIN)/cfplan fly flights/loop3d.yaml --records build/pictures/loop3d
 	$(BIN)/cfplan replay build/pictures/loop3d/* --figure docs/images/flight.png --force
+	for path in lawn-mower gates corridor; do \
+		$(BIN)/cfplan plan examples/paths/$$path.yaml --figure docs/images/$$path.png --force || exit 1; \
+	done
+	$(BIN)/cfplan plan examples/paths/obstacles.yaml --safety examples/paths/furnished-room.yaml \
+		--figure docs/images/obstacles.png --force
 	$(BIN)/python -m studies figures
 	$(BIN)/cfplan report build/pictures/figure8/* -o build/pictures/report.html --force
 	chromium --headless --no-sandbox --hide-scrollbars --window-size=1200,1500 \

@@ -114,7 +114,7 @@ def record(tmp_path_factory):
 def folder(tmp_path_factory):
     """A new folder with what the repository brings, a path and a plan of one's own, and a model."""
     folder = tmp_path_factory.mktemp("shown")
-    for name in ("flights", "results"):
+    for name in ("examples", "flights", "results"):
         shutil.copytree(REPOSITORY / name, folder / name)
     shutil.copy(REPOSITORY / "safety.yaml", folder)
     for name in ("path.yaml", "first.yaml"):

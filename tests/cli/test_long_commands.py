@@ -52,6 +52,7 @@ SMALL_STUDIES = {
     "simulators": QUICK,
     "steering": "--flights 1 --requests 5 --seconds 10",
     "stops": "",
+    "waypoints": "--sets 1 --rooms 1",
     "yaw-consistency": "--pairs 1",
 }
 
