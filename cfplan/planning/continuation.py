@@ -187,7 +187,7 @@ def check_waypoints(points: NDArray, limits: Limits) -> None:
         raise InfeasibleError(
             f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too {limits.space.too(face[at])}",
             where=f"waypoint {at + 1}",
-            hint="keep waypoints inside the space less its margin",
+            hint="keep waypoints inside the space less its margin, and that far from obstacles",
         )
 
 
