@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.geometry.continued import check_continued, continued_through
 from cfplan.geometry.guides import with_guides
-from cfplan.geometry.min_snap import centripetal_times, check_times
+from cfplan.geometry.min_snap import centripetal_times, check_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.features import REFERENCE, ScaledLimits, node_features, scaled_limits
@@ -49,7 +49,8 @@ from cfplan.vehicle.trajectory import Trajectory
 # 1,388: straight on for 1,202, by guides from the joint on for 129 of the others.
 FIRST_TIMES, FIRST_TIMES_TIMED, FIRST_TIMES_LATER = (0.7, 1.0, 1.4, 2.0, 3.0), (1.0, 1.4, 2.0), (1.0, 1.4, 2.0)
 LATER = (0.1, 0.35)
-GUIDES_IN_MOTION = (0.3, 0.1)  # m from waypoints, at which guides lie; and nominal times of the first segment with them
+GUIDES = (0.15, 0.3, 0.08, 0.5)  # m from waypoints, at which guides lie, in the order in which they are tried
+GUIDES_IN_MOTION = (0.3, 0.1)  # m likewise; and nominal times of the first segment with them
 FIRST_TIMES_GUIDED, FIRST_TIMES_GUIDED_LATER = (1.6, 2.5), (1.6,)
 FIRST_TIMES_GUIDED_AT_LAST = (1.1, 1.6, 2.5)  # the longer ones swing below the floor where the vehicle sinks fast
 NEAR = 0.05  # m from waypoint 1, nearer than which the path left is not left later
@@ -179,6 +180,25 @@ def continue_plan(
     )
 
 
+def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float, ...]]:
+    """Return a path through points, (K, 3) m, at rest at both ends, and the s of each but the first.
+
+    It has guides where it would swing outside the space without. Raises InputError where they are no waypoints.
+    """
+    given = np.asarray(points, dtype=float)
+    times = centripetal_times(given)
+    plain = min_snap(given, times=times), tuple(np.cumsum(times).tolist())
+    if not _unsound(plain[0], limits):
+        return plain
+    for away in GUIDES:
+        guided, rows = with_guides(given, away)
+        times = centripetal_times(guided)
+        path = min_snap(guided, times=times)
+        if not _unsound(path, limits):
+            return path, tuple(np.cumsum(times)[rows[1:] - 1].tolist())
+    return plain
+
+
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond, face = limits.space.nearest(points)
@@ -187,7 +207,7 @@ def check_waypoints(points: NDArray, limits: Limits) -> None:
         raise InfeasibleError(
             f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too {limits.space.too(face[at])}",
             where=f"waypoint {at + 1}",
-            hint="keep waypoints inside the space less its margin, and that far from obstacles",
+            hint="keep waypoints inside the space less its margin",
         )
 
 

@@ -36,8 +36,8 @@ from cfplan.planning.continuation import (
     Ways,
     check_waypoints,
     continue_plan,
+    path_from_rest,
 )
-from cfplan.planning.path.choice import path_from_rest
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.certified_flight import (

@@ -13,12 +13,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, InputError
 from cfplan.geometry.path import Path
-from cfplan.geometry.path_file import PathFile, PathShape, path_through
+from cfplan.geometry.path_file import PathFile, PathShape
 from cfplan.geometry.waypoints import Gate
 from cfplan.planning.path.search import ChosenKnots, search, timed
 from cfplan.planning.plan import default_budget, plan
@@ -27,7 +26,6 @@ from cfplan.safety.space import inside
 
 CHOOSING = 0.5  # of the budget of planning
 CERTIFYING = 0.2  # of the time for choosing, kept for certifying what was found
-FEW_ITERATIONS = 12  # of a descent while the vehicle hovers and waits
 
 
 class FastestPath(NamedTuple):
@@ -100,21 +98,6 @@ def fastest_path(
     )
 
 
-def path_from_rest(points: ArrayLike, limits: Limits) -> tuple[Path, tuple[float, ...]]:
-    """Return a path through points, (K, 3) m, at rest at both ends, and the s of each but the first.
-
-    Its times are chosen in a few steps, and points between the waypoints only if it leaves the space without. Raises
-    InputError where they are no waypoints.
-    """
-    path_file = path_through(points)
-    for between in (False, True):
-        found = search(path_file, limits, NEVER, between=between, iterations=FEW_ITERATIONS)
-        if inside(found.missed):
-            break
-    path = found.knots.path
-    return path, tuple(path.breaks[found.knots.waypoint[1:]].tolist())
-
-
 def _check_gates(path_file: PathFile, limits: Limits) -> None:
     """Raise InfeasibleError where a gate leaves no room for the vehicle."""
     margin = limits.space.margin
@@ -134,19 +117,19 @@ def _check_kept(found: ChosenKnots, path_file: PathFile) -> None:
 
     Walls and obstacles are checked by what plans the path.
     """
-    path = found.knots.path
+    path, cut, more = found.knots.path, not found.finished, "give planning more time (--budget)"
     for number, (point, region) in enumerate(zip(found.knots.waypoint, path_file.regions, strict=True), start=1):
         between = 0 < point < len(found.knots.times)
         if between and isinstance(region, Gate) and float(path(path.breaks[point], 1) @ region.forwards) <= 0.0:
             raise InfeasibleError(
                 f"no path was found that passes the gate at waypoint {number} forwards",
                 where=str(path_file.source),
-                hint="add a waypoint before it or behind it, or turn its yaw_deg by 180",
+                hint=more if cut else "add a waypoint before it or behind it, or turn its yaw_deg by 180",
             )
     if path_file.corridor is not None and not inside(found.aside):
         raise InfeasibleError(
             f"no path was found that stays within {path_file.corridor:g} m of the straight lines: the best leaves them "
             f"by {found.aside + path_file.corridor:.3f} m",
             where=str(path_file.source),
-            hint="widen the corridor, or give waypoints that turn less sharply",
+            hint=more if cut else "widen the corridor, or give waypoints that turn less sharply",
         )

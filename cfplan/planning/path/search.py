@@ -42,31 +42,25 @@ def timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
     return Knots(lengths, points, waypoint), Knots(centripetal * (lengths.sum() / centripetal.sum()), points, waypoint)
 
 
-def search(
-    path_file: PathFile, limits: Limits, deadline: Deadline, *, between: bool = True, iterations: int = ITERATIONS
-) -> ChosenKnots:
+def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
     """Return the best that descent finds of segment times, of waypoints within their regions, and of points between.
 
     Where link loss must end clear of obstacles, it is sought where that is likely; and elsewhere if there is none.
-    Without `between` there are no more points than waypoints, and corners of ways around obstacles. A descent takes so
-    many `iterations` at most.
     """
     room = Room(limits.space, path_file.waypoints, path_file.corridor)
     rooms = [room]
     if limits.space.obstacles and not limits.link_loss.only_warn:
         rooms = [room.to_come_down(), room]
     for each in rooms:
-        found = _search_in(each, path_file, limits, deadline, between, iterations)
+        found = _search_in(each, path_file, limits, deadline)
         if inside(found.missed) or not found.finished:
             break
     return found
 
 
-def _search_in(
-    room: Room, path_file: PathFile, limits: Limits, deadline: Deadline, between: bool, iterations: int
-) -> ChosenKnots:
+def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
     """Return the best from the better of two timings."""
-    starts = [_started(path_file, knots, between) for knots in timed(*with_corners(path_file.waypoints, room.space))]
+    starts = [_started(path_file, knots) for knots in timed(*with_corners(path_file.waypoints, room.space))]
     costs = []
     for start in starts:
         variables = variables_of(start, path_file.regions, path_file.laps, limits.space.margin)
@@ -74,20 +68,20 @@ def _search_in(
     cost = min(costs, key=lambda each: each(each.variables.first)[0])
     x = cost.variables.first
     if not inside(cost.missed(x)):
-        x, _ = _descend_inside(cost, cost.by_length, x, ROUGHLY, iterations, deadline)
-    x, finished = _descend_inside(cost, cost, x, TOLERANCE, iterations, deadline)
+        x, _ = _descend_inside(cost, cost.by_length, x, ROUGHLY, deadline)
+    x, finished = _descend_inside(cost, cost, x, TOLERANCE, deadline)
     x = x if cost.best is None else cost.best
     return ChosenKnots(cost.variables.knots(x), cost.missed(x), cost.aside(x), finished)
 
 
 def _descend_inside(
-    kept: PathCost, cost: Cost, x: NDArray, tolerance: float, iterations: int, deadline: Deadline
+    kept: PathCost, cost: Cost, x: NDArray, tolerance: float, deadline: Deadline
 ) -> tuple[NDArray, bool]:
     """Descend from x until the path stays inside the room, and return where that ended, and whether in time."""
     kept.reserve = 0.0
     for weight in WEIGHTS:
         kept.weight = weight
-        descent = descend(cost, x, deadline, tolerance=tolerance, iterations=iterations)
+        descent = descend(cost, x, deadline, tolerance=tolerance, iterations=ITERATIONS)
         x = descent.x
         missed = kept.missed(x)
         if inside(missed) or not descent.finished or descent.cost == math.inf:
@@ -96,10 +90,8 @@ def _descend_inside(
     return x, descent.finished
 
 
-def _started(path_file: PathFile, knots: Knots, between: bool) -> Knots:
-    """Return where a search starts: with a point between each two, or none; these lead into gates forwards."""
-    if not between:
-        return knots
+def _started(path_file: PathFile, knots: Knots) -> Knots:
+    """Return where a search starts: with a point between each two, which leads into gates forwards."""
     knots = with_points_between(knots)
     for point, region in zip(knots.waypoint, path_file.regions, strict=True):
         if isinstance(region, Gate):
