@@ -29,7 +29,7 @@ from cfplan.simulation.link_loss import (
 
 MARGIN = 0.02  # m inside the walls that planning aims at: what the last refinement changes stays within
 OUTSIDE_HINT = (
-    "keep the path farther from that wall; in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
+    "keep the path farther from there; in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 )
 _LEAST_REACH = 1e-3  # m
 STOPS_EVERY, STOPS_EACH = 10, 12  # setpoints between sampled stops, and within them

@@ -3,6 +3,7 @@
 A face is a wall, the floor, the ceiling, or the surface of an obstacle; plans keep the same margin from each.
 """
 
+import itertools
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -140,16 +141,19 @@ class Space:
 
         Made for many that follow a way. Where all are clear, obstacles may be farther off than it says.
         """
-        if not self.obstacles:
-            return float(self.beyond([positions.min(axis=0), positions.max(axis=0)]).max())
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        beyond = self.beyond((low + high) / 2, (high - low) / 2)  # of a box about all
+        near = ~(beyond[SIDES:] <= 0.0)
+        clear = float(np.where(near, -np.inf, beyond[SIDES:]).max(initial=-np.inf))
+        if not near.any():
+            return max(float(beyond[:SIDES].max()), clear)
+        close = replace(self, obstacles=tuple(itertools.compress(self.obstacles, near)))
         begins = np.arange(0, len(positions), _BLOCK)
         low, high = np.minimum.reduceat(positions, begins), np.maximum.reduceat(positions, begins)
-        bound, _ = self.nearest((low + high) / 2, (high - low) / 2)
-        near = ~(bound <= 0.0)
-        if not near.any():
-            return float(bound.max())
-        exact, _ = self.nearest(positions[np.repeat(near, np.diff(begins, append=len(positions)))])
-        return float(max(exact.max(), bound[~near].max(initial=-np.inf)))
+        bound, _ = close.nearest((low + high) / 2, (high - low) / 2)
+        open_ = ~(bound <= 0.0)
+        exact, _ = close.nearest(positions[np.repeat(open_, np.diff(begins, append=len(positions)))])
+        return float(max(exact.max(initial=-np.inf), bound[~open_].max(initial=-np.inf), clear))
 
     def above_floor(self, positions: NDArray) -> tuple[NDArray, NDArray]:
         """Return, as nearest(), how far the columns between the floor and positions, (N, 3) m, are beyond a face."""

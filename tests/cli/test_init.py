@@ -18,6 +18,8 @@ def test_the_first_path_lies_in_the_room(cfplan, tmp_path, room):
     first = load_path_file(tmp_path / "lab" / "first.yaml")
     check_space(first.path, limits.space, waypoints=first.waypoints)
     assert first.speed == 0.5
+    assert "obstacles: []" in (text := (tmp_path / "lab" / "safety.yaml").read_text())
+    assert all(example in text for example in ("# ", "box: {low: [", "cylinder: {x: "))
 
 
 def test_the_first_path_of_a_small_room_is_planned_and_certified(cfplan, tmp_path):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.min_snap import min_snap
-from cfplan.safety.space import SIDES, TOLERANCE, Box, Cylinder, Space, check_space, distances_beyond, inside
+from cfplan.safety.space import FLOOR, SIDES, TOLERANCE, Box, Cylinder, Space, check_space, distances_beyond, inside
 
 SPACE = Space(low=(-2.0, -3.0, 0.0), high=(2.0, 3.0, 2.0), margin=0.2)
 coordinate = st.floats(-2.2, 2.2)
@@ -208,3 +208,23 @@ def test_a_thousand_obstacles_say_the_same_as_each_of_them_alone():
     _, beyond = distances_beyond(path, Space(SPACE.low, SPACE.high, 0.05, many))
     alone = [distances_beyond(path, Space(SPACE.low, SPACE.high, 0.05, (each,)))[1].max() for each in many]
     assert beyond.max() == pytest.approx(max(alone), abs=2e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(boxes() | cylinders(), max_size=5), st.integers(0, 1000))
+def test_shorter_ways_to_the_worst_of_many_positions_say_what_each_position_says(obstacles, seed):
+    space = Space((-2.0, -2.0, -2.0), (2.0, 2.0, 2.0), 0.1, tuple(obstacles))
+    steps = np.random.default_rng(seed).normal(0.0, 0.02, (400, 3))
+    positions = np.clip(np.cumsum(steps, axis=0), -1.7, 1.7)
+    all_of_them = space.beyond(positions)
+    beyond, face = space.nearest(positions)
+    np.testing.assert_allclose(beyond, all_of_them.max(axis=1), atol=1e-12)
+    np.testing.assert_array_equal(face, all_of_them.argmax(axis=1))
+    worst = all_of_them.max()
+    if worst > 0.0:
+        assert space.farthest(positions) == pytest.approx(worst, abs=1e-12)
+    else:
+        assert worst - 1e-12 <= space.farthest(positions) <= 0.0
+    np.testing.assert_allclose(
+        space.nearest(positions, floor=False)[0], np.delete(all_of_them, FLOOR, axis=1).max(axis=1), atol=1e-12
+    )

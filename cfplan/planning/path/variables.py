@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.min_snap import least_snap
+from cfplan.geometry.path import Path
 from cfplan.geometry.waypoints import Gate, Region, Within
 
 TIME_UNIT = 0.3  # of the logarithm of a segment time, a variable's unit
@@ -23,6 +24,11 @@ class Knots(NamedTuple):
     times: NDArray  # (M,) s
     points: NDArray  # (M+1, 3) m
     waypoint: NDArray  # (K,) which of the points are the waypoints
+
+    @property
+    def path(self) -> Path:
+        """Return the path of least snap through the points. Raises InputError where there is none."""
+        return least_snap(self.points, self.times)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +113,7 @@ def variables_of(knots: Knots, regions: tuple[Region, ...], laps: int, margin: f
 
 def with_points_between(knots: Knots) -> Knots:
     """Return knots with one more between each two, where the path of least snap is half-way in time."""
-    path = least_snap(knots.points, knots.times)
+    path = knots.path
     breaks = np.concatenate([[0.0], np.cumsum(knots.times)])
     points = np.empty((2 * len(knots.points) - 1, 3))
     points[::2], points[1::2] = knots.points, path((breaks[:-1] + breaks[1:]) / 2)

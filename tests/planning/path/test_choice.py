@@ -155,6 +155,12 @@ def test_gates_are_passed_through_forwards(yaw, limits):
     assert flight(chosen.path, limits) == chosen.duration
 
 
+def test_a_corridor_that_no_path_keeps_is_refused(limits):
+    """At 1 mm from the lines it would have to stop at each waypoint, which no path of least snap does."""
+    with pytest.raises(InfeasibleError, match=r"within 0.001 m of the straight lines.*by 0\.\d+ m.*hint: widen"):
+        choose(RANDOM["random 500"], limits, corridor=0.001)
+
+
 def test_a_gate_that_the_margin_fills_is_refused(limits):
     with pytest.raises(InfeasibleError, match=r"gate at waypoint 2 is 0.4 m wide.*0.2 m.*hint"):
         choose([[-1.5, 0, 1], [0, 0, 1], [1.5, 0, 1]], limits, regions=(None, Gate(0.0, 0.4, 1.0), None))

@@ -1,0 +1,102 @@
+"""The search for the path through waypoints that is flown soonest: where it starts, and how it is kept in the room."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.deadline import Deadline
+from cfplan.geometry.min_snap import centripetal_times
+from cfplan.geometry.path_file import PathFile
+from cfplan.geometry.waypoints import Gate
+from cfplan.planning.path.cost import PathCost
+from cfplan.planning.path.descent import Cost, descend
+from cfplan.planning.path.detour import with_corners
+from cfplan.planning.path.room import Room
+from cfplan.planning.path.variables import Knots, variables_of, with_points_between
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
+
+TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps improve it at last; steps at most
+ROUGHLY = 0.01  # the same of a first descent, by the length of the path
+# Weights of what leaves the room, s/m³: each descent that ends outside is followed by one with the next weight, which
+# keeps further inside by what was missed.
+WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
+RESERVE = 0.002  # m, that is kept inside besides what was missed
+
+
+class ChosenKnots(NamedTuple):
+    """Where a search ended."""
+
+    knots: Knots
+    missed: float  # m, by which the path leaves the room; negative inside
+    aside: float  # m, by which it leaves the corridor; likewise
+    finished: bool  # before the deadline
+
+
+def timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
+    """Return points with times like their straight lengths, and with centripetal ones; `waypoint` of them are such."""
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    centripetal = centripetal_times(points)
+    return Knots(lengths, points, waypoint), Knots(centripetal * (lengths.sum() / centripetal.sum()), points, waypoint)
+
+
+def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
+    """Return the best that descent finds of segment times, of waypoints within their regions, and of points between.
+
+    Where link loss must end clear of obstacles, it is sought where that is likely; and elsewhere if there is none.
+    """
+    room = Room(limits.space, path_file.waypoints, path_file.corridor)
+    rooms = [room]
+    if limits.space.obstacles and not limits.link_loss.only_warn:
+        rooms = [room.to_come_down(), room]
+    for each in rooms:
+        found = _search_in(each, path_file, limits, deadline)
+        if inside(found.missed) or not found.finished:
+            break
+    return found
+
+
+def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
+    """Return the best from the better of two timings."""
+    starts = [_started(path_file, knots) for knots in timed(*with_corners(path_file.waypoints, room.space))]
+    costs = []
+    for start in starts:
+        variables = variables_of(start, path_file.regions, path_file.laps, limits.space.margin)
+        costs.append(PathCost(path_file, limits, room, variables, deadline))
+    cost = min(costs, key=lambda each: each(each.variables.first)[0])
+    x = cost.variables.first
+    if not inside(cost.missed(x)):
+        x, _ = _descend_inside(cost, cost.by_length, x, ROUGHLY, deadline)
+    x, finished = _descend_inside(cost, cost, x, TOLERANCE, deadline)
+    x = x if cost.best is None else cost.best
+    return ChosenKnots(cost.variables.knots(x), cost.missed(x), cost.aside(x), finished)
+
+
+def _descend_inside(
+    kept: PathCost, cost: Cost, x: NDArray, tolerance: float, deadline: Deadline
+) -> tuple[NDArray, bool]:
+    """Descend from x until the path stays inside the room, and return where that ended, and whether in time."""
+    kept.reserve = 0.0
+    for weight in WEIGHTS:
+        kept.weight = weight
+        descent = descend(cost, x, deadline, tolerance=tolerance, iterations=ITERATIONS)
+        x = descent.x
+        missed = kept.missed(x)
+        if inside(missed) or not descent.finished or descent.cost == math.inf:
+            break
+        kept.reserve += missed + RESERVE
+    return x, descent.finished
+
+
+def _started(path_file: PathFile, knots: Knots) -> Knots:
+    """Return where a search starts: with a point between each two, which leads into gates forwards."""
+    knots = with_points_between(knots)
+    for point, region in zip(knots.waypoint, path_file.regions, strict=True):
+        if isinstance(region, Gate):
+            for beside, side in ((point - 1, -1.0), (point + 1, 1.0)):
+                if 0 <= beside < len(knots.points):
+                    far = np.linalg.norm(knots.points[beside] - knots.points[point])
+                    knots.points[beside] = knots.points[point] + side * far * region.forwards
+    return knots
