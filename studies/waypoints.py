@@ -3,8 +3,7 @@
 The sets are of many kinds, in the shipped room or in a larger hall. Each is also flown in a tight room, whose walls
 leave 0.15 m around the box of the waypoints, and with every waypoint passed within a distance. Other rooms have
 obstacles between the waypoints; there, plans also give way for link loss and stops, as flights do. Tracks with
-published coordinates
-are flown in a space around them.
+published coordinates are flown in a space around them.
 """
 
 import math
@@ -155,7 +154,7 @@ def _measure_furnished(seed: int, limits: Limits) -> ChosenFlight:
 
 
 def _fly(path_file: PathFile, limits: Limits) -> tuple[Plan, FastestPath]:
-    """Return the plan along the chosen path, and what the choice was worth. Raises a CfplanError."""
+    """Return the plan along the chosen path, and the choice. Raises a CfplanError."""
     chosen = fastest_path(path_file, limits)
     return plan(chosen.path, limits.airframe, limits), chosen
 

@@ -60,7 +60,7 @@ def plan(
 
 
 def _bounds(planned: "PlannedFlight", steps: Steps) -> dict[str, float | None]:
-    """Return the bounds on the flight's duration, s, for JSON, and compare with them in steps of their own."""
+    """Return the bounds on the flight's duration, s, for JSON, and report how it compares with each as a step."""
     duration, speed_factor = planned.duration, planned.plan.speed_factor
     with steps.step("bound") as results:
         along_path = planned.lower_bound()

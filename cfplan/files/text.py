@@ -24,7 +24,7 @@ UNITS = {  # in SI
     "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "ns": 1e-9,
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "meters": 1.0, "centimeters": 1e-2, "millimeters": 1e-3,
 }  # fmt: skip
-_UNIT = re.compile(r"\s*\[\s*([^\]]*?)\s*\]")  # behind a name
+_UNIT = re.compile(r"\s*\[\s*([^\]]*?)\s*\]")  # after a name
 _SEPARATOR = re.compile(r"\s*[,;]\s*|\s+")
 
 
@@ -97,11 +97,11 @@ def read_table(file: pathlib.Path, columns: int, what: str) -> tuple[NDArray, li
 def read_named_table(
     file: pathlib.Path, names: Sequence[str], what: str, *, more: str = ""
 ) -> tuple[NDArray, list[int], list[str]]:
-    """Read rows of the columns `names` in SI; the line number of each; and the columns that the file has besides.
+    """Read the columns `names`; return the rows in SI units, the line number of each, and the names of other columns.
 
-    A first line that names all of them, in any case, says where they are and, as in `x [mm]`, in which unit. Otherwise
-    they are the only columns, in this order, but for one that is called `more` and may follow. The name `t` stands for
-    a time, which may count from 1970: a file that names one is for `names` with it alone.
+    A first line that names all of them, in any case, gives their order and, as in `x [mm]`, their units. Without such a
+    line the file has these columns alone, in this order; one more, called `more`, may follow. `t` is a time, which may
+    count from 1970; a header with a time is used only if `names` has `t`.
 
     Raises:
         InputError: as read_table(); an unknown unit.

@@ -53,7 +53,7 @@ def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0, times: ArrayLi
 
 
 def least_snap(points: NDArray, times: NDArray) -> Path:
-    """Return what min_snap() does of points, (K, 3) m, and times, (K-1,) s, that need no checks."""
+    """Return the path of min_snap() through points, (K, 3) m, with times, (K-1,) s, without its checks."""
     return rest_path(times, pieces_through(points, times, start=REST, rest_end=True))
 
 
@@ -182,7 +182,7 @@ def derivatives_at(points: NDArray, times: NDArray, start: NDArray | None, rest_
 
 
 def solve_adjoint(points: NDArray, times: NDArray, right: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
-    """Return what the equations of derivatives_at() give for another right side, (K, 3, 3); 0 where they are given."""
+    """Return the solution of derivatives_at()'s equations for another right side, (K, 3, 3); 0 at given derivatives."""
     result = np.zeros((len(points), 3, 3))
     first, last = _unknown(points, start, rest_end)
     if last > first:
@@ -192,7 +192,7 @@ def solve_adjoint(points: NDArray, times: NDArray, right: NDArray, start: NDArra
 
 
 def _unknown(points: NDArray, start: NDArray | None, rest_end: bool) -> tuple[int, int]:
-    """Return from which point on, and before which, derivatives are to be found."""
+    """Return the first point whose derivatives are unknown, and the end of these points."""
     return 0 if start is None else 1, len(points) - 1 if rest_end else len(points)
 
 

@@ -1,7 +1,7 @@
 """Derivatives of min-snap paths by their segment times and points, by one adjoint solve of their banded equations.
 
-The equations of least snap, M d = f, give the derivatives d at the points. What depends on a path, through times,
-points and d, changes with times and points directly, and through d by λ·(∂f - ∂M d), where M λ is its derivative by d
+The equations of least snap, M d = f, give the derivatives d at the points. A function of times, points and d changes
+with times and points directly, and through d by λ·(∂f - ∂M d), where M λ is its derivative by d
 (Wang et al., "Geometrically constrained trajectory optimization for multicopters", 2022).
 """
 
@@ -14,7 +14,7 @@ _POWERS = np.tile(np.arange(4), 2)  # of a segment's time, by which the values a
 
 
 def _bases() -> NDArray:
-    """Return (6, 8, 8): by order of the derivative, what turns values at both ends of [0, 1] into coefficients."""
+    """Return (6, 8, 8): for each order of derivative, the matrix from values at both ends of [0, 1] to coefficients."""
     bases = [HERMITE]
     for _ in range(5):
         bases.append(np.vstack([bases[-1][1:] * np.arange(1, 8)[:, None], np.zeros(8)]))
@@ -27,10 +27,10 @@ _BASES = _bases()
 def gradient_by_times_and_points(
     points: NDArray, times: NDArray, s: NDArray, by_path: NDArray, start: NDArray | None = REST
 ) -> tuple[NDArray, NDArray]:
-    """Return how what depends on a path changes with segment times, (K-1,), and with points, (K, 3).
+    """Return the gradient of a function of a path by its segment times, (K-1,), and its points, (K, 3).
 
-    `by_path`, (5, 3, P), is how it changes with γ to γ'''' at the places s, (P,), along the path that pieces_through()
-    lays through these points, at rest at the end. The places keep their s while pieces move under them.
+    `by_path`, (5, 3, P), is its gradient by γ to γ'''' at the places s, (P,), along the path that pieces_through() lays
+    through these points, at rest at the end. The places keep their s when the breaks between pieces move.
     """
     count = len(times)
     breaks = np.concatenate([[0.0], np.cumsum(times)])

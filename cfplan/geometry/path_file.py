@@ -4,7 +4,7 @@ name: figure eight
 waypoints: [[0, 0, 1], [1, 1, 1], …]    # see below; or  points: file.csv  (waypoints, x, y, z a row)
                                         # or  curve: file.csv  (samples of a curve, x, y, z a row)
                                         # or  polynomials: file.csv  (as Crazyswarm writes them)
-                                        # or  samples: file.csv  (t, x, y, z a row; the way is kept, the timing not)
+                                        # or  samples: file.csv  (t, x, y, z a row; their timing is not kept)
 shape: fastest                          # of waypoints: the path is chosen when planning; or min-snap
 times: centripetal                      # of the segments of shape min-snap; or length
 corridor: 0.3                           # m that the fastest path may lead away from the straight lines, if given
@@ -53,7 +53,7 @@ from cfplan.geometry.yaw import YawMode
 _LEAST_SAMPLED = 4  # points that a smooth path with free ends needs
 _MANY_WAYPOINTS = 50  # rows of `points`: more are rather samples of a curve
 _MAX_POINTS = 50_000  # over all laps
-MOST_WITHIN = 100.0  # m, of what surrounds a waypoint or a line
+MOST_WITHIN = 100.0  # m, of a region, a gate or a corridor
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
 
@@ -121,7 +121,7 @@ def _share(value: Any) -> Any:
 
 
 class _Waypoint(BaseModel):
-    """A waypoint as files have it: a list of numbers, or keys with values."""
+    """A waypoint of a file: a list of numbers, or keys with values."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -219,7 +219,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
 
 
 def _check_choice(content: _Content, places: Places, given: str, through: bool) -> None:
-    """Raise InputError where a file says how to choose a path that it gives, or that it has otherwise chosen."""
+    """Raise InputError for keys that do not apply to the file's source or shape."""
     for key in ("shape", "times", "corridor"):
         if key in content.model_fields_set and not through:
             raise InputError(
@@ -342,14 +342,14 @@ def _from_curve(content: _Content, places: Places) -> tuple[Any, ...]:
 
 
 def _least_snap(content: _Content) -> Callable[[NDArray], Path]:
-    """Return what lays a path of least snap through points, with the segment times that the file says."""
+    """Return the function that lays a path of least snap through points, with the file's segment times."""
     if content.times is SegmentTimes.LENGTH:
         return min_snap
     return lambda points: min_snap(points, times=_nominal(points))
 
 
 def _nominal(points: NDArray) -> NDArray:
-    """Return centripetal times, (K-1,) s, in which points, (K, 3) m, are passed at 1 m/s in the mean."""
+    """Return centripetal times, (K-1,) s, for a mean speed of 1 m/s between points, (K, 3) m."""
     times = centripetal_times(points)
     return times * (np.linalg.norm(np.diff(points, axis=0), axis=1).sum() / times.sum())
 

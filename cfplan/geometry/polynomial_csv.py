@@ -19,7 +19,7 @@ _COLUMNS = 1 + 4 * 8
 _MIN_DURATION = 0.001  # s
 _POSITION_STEP = 0.001  # m allowed between pieces
 _SPACING = 0.04  # m between samples of a curve whose snap jumps
-_TIMES = 50  # moments of a piece at which its samples are looked for
+_TIMES = 50  # moments of a piece, between which its samples are placed
 _MOST_SAMPLES = 50_000
 _DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative along any of them: covers six decimals
 _HEADER = ["duration", *(f"{axis}^{power}" for axis in ("x", "y", "z", "yaw") for power in range(8))]
@@ -31,7 +31,7 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Any, ...]:
     """Return the curve of a polynomial file, at rest at both ends, and the points (K, 3) m where its rows meet.
 
     The file's timing and its yaw are not used: the planner times the path, and the yaw mode gives the yaw. Where snap
-    jumps between rows, the curve is drawn smoothly through samples, and a few words say how far it is from them.
+    jumps between rows, the curve is drawn smoothly through samples, and a note says how far it is from them.
 
     Raises:
         InputError: rows of another length, durations too short, jumps up to jerk between rows; names the line.
@@ -88,7 +88,7 @@ def read_polynomial_rows(file: pathlib.Path) -> tuple[NDArray, NDArray]:
 
 
 def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> int:
-    """Return at how many joints snap jumps. Raises InputError where another derivative does, or a piece is short."""
+    """Return at how many joints snap jumps. Raises InputError where a lower derivative does, or a piece is short."""
     left, right = end_values(durations, table)
     extent = np.abs(table[:, 1:] * durations[:, None, None] ** np.arange(1, 8)[:, None]).sum(axis=1).max(axis=1)
     if (extent < _POSITION_STEP).any():

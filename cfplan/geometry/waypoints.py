@@ -1,4 +1,4 @@
-"""Where a path may pass a waypoint: exactly there, within a distance, or through a gate."""
+"""Regions in which a path may pass a waypoint: a ball around it, or a gate."""
 
 import math
 from dataclasses import dataclass, replace

@@ -52,7 +52,7 @@ def draw_plan(
     path_file: PathFile | None = None,
     least_snap: CurvePath | None = None,
 ) -> "Figure":
-    """Return the figure of a plan, with what was flown over it, its waypoints, and the path that it was chosen over."""
+    """Return the figure of a plan, with its flight, its waypoints, and the min-snap path that it is compared with."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 

@@ -50,7 +50,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_stops
 
         limits = load_limits(safety_file)
-        limits = replace(limits, space=replace(limits.space, obstacles=()))  # which may be in the middle
+        limits = replace(limits, space=replace(limits.space, obstacles=()))  # one may stand in the middle
         middle = (np.array(limits.space.low) + limits.space.high) / 2
         places = np.array([[-1.0, -1.0, -0.5], [1.0, 0.0, 0.0], [1.0, 1.0, 0.5]])  # three, so that something is solved
         path = min_snap(middle + 0.2 * places)

@@ -175,7 +175,7 @@ def _every(count: int, step: int) -> NDArray:
 
 
 def _reach(moments: LinkLossMoments) -> NDArray:
-    """Return how far each goes towards the wall that it comes nearest to, m, positive; aside if that is an obstacle."""
+    """Return how far each moves towards the nearest wall, m, positive; horizontally if that is an obstacle."""
     to_walls = np.concatenate([moments.place - moments.low, moments.high - moments.place], axis=1)
     wall = np.minimum(moments.face, SIDES - 1)
     reach = np.where(moments.face < SIDES, to_walls[np.arange(len(wall)), wall], moments.distance)

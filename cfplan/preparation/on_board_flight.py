@@ -42,7 +42,7 @@ from cfplan.vehicle.trajectory import Trajectory
 _MARGIN = 0.02  # m inside the walls that planning aims at: polynomials are slower than their plan, not quite on it
 _DEVIATION = 0.04  # m, that planning expects of the dry run
 _FALL_HINT = (
-    "keep the path farther from that wall, or fly it with a lower --speed; in a room with nets, write `outside: warn` "
+    "keep the path farther from there, or fly it with a lower --speed; in a room with nets, write `outside: warn` "
     "under `link_loss` in safety.yaml"
 )
 

@@ -59,7 +59,7 @@ class PlannedFlight:
     link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
     was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
     path_file: PathFile | None = None  # what was planned, where that is known
-    fastest: FastestPath | None = None  # what choosing its path was worth, where it was chosen
+    fastest: FastestPath | None = None  # the choice of its path, where one was made
 
     def __repr__(self) -> str:
         verdict = "certified" if self.certificate.passed else "not certified"

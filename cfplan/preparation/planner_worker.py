@@ -96,7 +96,7 @@ class PlannerWorker:
 
     @property
     def _middle(self) -> list[tuple[float, ...]]:
-        """Return two places in the middle of the space, m, apart; without those that obstacles take."""
+        """Return two separate places in the middle of the space, m, without those too near to obstacles."""
         space = self._limits.space
         shares = (0.4, 0.6)
         places = [

@@ -40,7 +40,7 @@ class Proposed:
     before: HeldFlight | None = None  # what is held where it does not pass; None where its answer is waited for
 
     def answer(self, answer: PilotAnswer, now: float) -> PathAnswer:
-        """Return the answer to the request by the pilot's to the proposal, which has come now, s."""
+        """Return the answer to the request, by the pilot's answer to the proposal, which came at `now`, s."""
         request, made = self.request, self.made
         assert request is not None
         if answer.commitment is None:

@@ -4,8 +4,8 @@ must come down inside the walls.
 Where it will stand before take-off is not known yet. The worst is a way straight towards a wall or away from one that
 is just so long that it takes the least time, as nothing else accelerates as much, and take-off beside two walls. So
 these are looked at: to the start from all sides so far away, from each wall and from each corner, and take-off there.
-Of these, ways that an obstacle stands in or beneath are left out, as preflight allows none, and those that begin close
-beside one: where a vehicle stands between a wall and an obstacle, each keeps it from the other.
+Ways with an obstacle on them or beneath are left out, as preflight refuses these, and so are ways that begin close to
+an obstacle: between a wall and an obstacle, the vehicle leans away from each towards the other.
 """
 
 from collections.abc import Iterator
@@ -29,13 +29,13 @@ from cfplan.safety.space import Space, inside
 from cfplan.simulation.link_loss import link_loss_of_slow_motion
 
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
-_PLACES = 200  # on the way to the start, that are looked at for obstacles
-_BESIDE = 0.3  # m more than the margin from obstacles, where a take-off tells about walls
+_PLACES = 200  # on the way to the start, checked for obstacles
+_BESIDE = 0.3  # m, beyond the margin, between obstacles and a take-off that is simulated
 _BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
 _NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 _TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
-_START_HINT = f"lower `ground.go_to_speed`, or begin the path farther from that wall; {_NETS}"
-_LANDING_HINT = f"end the path farther from that wall; {_NETS}"
+_START_HINT = f"lower `ground.go_to_speed`, or begin the path farther from there; {_NETS}"
+_LANDING_HINT = f"end the path farther from there; {_NETS}"
 
 _Motion = tuple[str, str, NDArray]  # what it is and from where, a hint, its payloads
 
@@ -89,7 +89,7 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
 
 
 def _clear(begin: Triple, end: Triple, space: Space) -> bool:
-    """Return whether a way and all beneath it are clear of obstacles; elsewhere preflight refuses to begin."""
+    """Return whether a way and the space beneath it are clear of obstacles; preflight refuses others."""
     if not space.obstacles:
         return True
     way = np.linspace(begin, end, _PLACES)

@@ -39,7 +39,7 @@ BLOCK = 512  # samples searched for a peak at once
 _INTERPRETED_BATCHES = 20  # as many times as many where samples are taken with numpy
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS, OBSTACLES = "distance to the walls", "distance to obstacles"
-OF_PLACE = (WALLS, OBSTACLES)  # which the path decides, however fast it is flown
+OF_PLACE = (WALLS, OBSTACLES)  # decided by the path alone, at any speed
 CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
 _MOST_ADDED = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
@@ -215,7 +215,7 @@ def half_of(space: Space) -> float:
 
 
 def obstacle_margin(path: Path, space: Space, time_at: Callable[[NDArray], Any]) -> Margin:
-    """Return the margin of a path's distance to obstacles, flown at s at the times that `time_at` returns, s."""
+    """Return the margin of a path's distance to obstacles; `time_at` returns when the flight passes s, in s."""
     s, beyond = beyond_obstacles(path, space)
     worst = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
     bound = _Bound(Quantity(OBSTACLES, "m", "", "", AT_LEAST, dense.POSITION, 1), space.margin, half_of(space))

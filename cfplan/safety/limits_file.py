@@ -42,7 +42,7 @@ _LEAST_PLANNED = {
 }
 """What a limit of planned motion must allow at least: noise of the gyroscope and of poses would hide slower motion."""
 
-_LOOKED_AT = 65  # places along the room and across it where a take-off may end
+_LOOKED_AT = 65  # grid places along the room and across it, where a take-off might end
 
 _QUARTER_TURN = math.pi / 2  # a limit of tilt below so many degrees is taken for radians
 
@@ -456,7 +456,7 @@ def _check_obstacles(limits: Limits, places: Places) -> None:
     raise InputError(
         f"the obstacles, each with the margin of {space.margin:g} m about it, leave no place to take off to",
         where=places.where("space", "obstacles"),
-        hint="give only what stands in the room, or lower the margin; a room that is furnished is a smaller `space`",
+        hint="give only what stands in the room, or lower the margin; or choose a smaller `space` around the free part",
     )
 
 

@@ -18,23 +18,22 @@ from cfplan.numbers import coordinates, shown
 _SAMPLES = 33  # of each piece of a path
 _AXES = ("x", "y", "z")
 FLOOR = 2  # its number among the faces
-SIDES = 6  # faces of the room itself, with floor and ceiling; obstacles come behind
+SIDES = 6  # faces of the room itself, with floor and ceiling; obstacles follow
 TOLERANCE = 1e-6
 """m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
 packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
 _MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
-_BLOCK = 16  # positions that follow one another, about which a box may tell enough
-_ROUND = 33  # points around a cylinder that is drawn
+_BLOCK = 16  # consecutive positions whose bounding box is checked first
+_ROUND = 33  # points of a cylinder's outline in drawings
 _AT_ONCE = 1 << 14  # distances between positions and obstacles that are computed at once, at most
-_PARTS, _LEVELS = 8, 6  # that a stretch of a path beside an obstacle is cut into where it is undecided, and how often
-_WORST = 1e-4  # m, within which it is known how near a path comes to the obstacles
+_PARTS, _LEVELS = 8, 6  # into which an undecided stretch of a path is cut, and how often at most
+_WORST = 1e-4  # m, error of the least distance between a path and the obstacles, at most
 
 
 def inside(beyond: ArrayLike, rounding: float = 0.0) -> Any:
-    """Return whether positions count as inside that are `beyond` a face, or a margin before it, m; NaN does not.
+    """Return whether positions count as inside by how far they are `beyond` a face or its margin, m; NaN does not.
 
-    All comparisons with walls and obstacles use this function. `rounding`, m, is by how much the positions were rounded
-    before.
+    All comparisons with walls and obstacles use this function. `rounding`, m, is the rounding of the positions.
     """
     return np.asarray(beyond) <= TOLERANCE + rounding
 
@@ -96,8 +95,8 @@ class Space:
     def beyond(self, positions: ArrayLike, half: ArrayLike = 0.0) -> NDArray:
         """Return (..., 6 + K) m: how far positions, (..., 3) m, are beyond each face less its margin; negative: clear.
 
-        The faces are in the order of `faces`. Of an obstacle it is the margin less the distance from it, which is
-        negative within it. `half`, (..., 3) m, is half the size of a box about each position that is to be clear.
+        The faces are in the order of `faces`. For an obstacle it is the margin less the distance from it, which is
+        negative within it. With `half`, (..., 3) m, each position is the middle of a box with these half-sizes.
         """
         points, half = np.asarray(positions, dtype=float), np.asarray(half, dtype=float)
         walls = [
@@ -112,9 +111,9 @@ class Space:
         )
 
     def nearest(self, positions: ArrayLike, half: ArrayLike = 0.0, *, floor: bool = True) -> tuple[NDArray, NDArray]:
-        """Return, (N,) each, how far positions, (N, 3) m, are beyond the face where that is most, m, and its number.
+        """Return how far positions, (N, 3) m, are beyond their worst face, (N,) m, and its number, (N,).
 
-        As the largest of beyond(), in less time and memory where there are many obstacles. The floor may be left out.
+        It is the largest of beyond(), in less time and memory if there are many obstacles. The floor may be left out.
         """
         points = np.asarray(positions, dtype=float)
         sizes = np.broadcast_to(np.asarray(half, dtype=float), points.shape)
@@ -156,16 +155,15 @@ class Space:
         return float(max(exact.max(initial=-np.inf), bound[~open_].max(initial=-np.inf), clear))
 
     def above_floor(self, positions: NDArray) -> tuple[NDArray, NDArray]:
-        """Return, as nearest(), how far the columns between the floor and positions, (N, 3) m, are beyond a face."""
+        """Return, like nearest(), how far the columns between the floor and positions, (N, 3) m, are beyond a face."""
         half = 0.5 * (positions[:, 2] - self.low[2])
         columns = np.stack([positions[:, 0], positions[:, 1], positions[:, 2] - half], axis=1)
         return self.nearest(columns, np.stack([0.0 * half, 0.0 * half, half], axis=1), floor=False)
 
     def swept(self, boxes: NDArray) -> tuple[NDArray, NDArray]:
-        """Return, (N,) each, how far vehicles come beyond a face, m, without its margin, and which is the worst.
+        """Return how far vehicles come beyond their worst face without its margin, (N,) m, and its number, (N,).
 
-        `boxes`, (N, S, 2, 3) m, are what each sweeps on its way to the floor, which therefore does not count, in S
-        parts.
+        `boxes`, (N, S, 2, 3) m, hold what each sweeps in S parts of its way to the floor, which does not count itself.
         """
         low, high = boxes[:, :, 0].reshape(-1, 3), boxes[:, :, 1].reshape(-1, 3)
         beyond, face = (
@@ -175,12 +173,12 @@ class Space:
         return beyond[number, worst] - self.margin, face[number, worst]
 
     def describe(self, beyond: float, face: int) -> str:
-        """Return where a place is that is so far, m, beyond a face: "0.12 m beyond the wall x = 2 m"."""
+        """Describe a place that is `beyond`, m, a face: "0.12 m beyond the wall x = 2 m"."""
         clear, past = ("from", "into") if face >= SIDES else ("inside", "beyond")
         return f"{abs(beyond):.2f} m {clear if inside(beyond) else past} {self.faces[face]}"
 
     def too(self, face: int) -> str:
-        """Return what a place is that is beyond a face less its margin: "far out", "near the obstacle 'table'"."""
+        """Return how messages describe a place beyond a face or its margin: "far out", "near the obstacle 'table'"."""
         return f"near {self.faces[face]}" if face >= SIDES else "far out"
 
     def holds(self, positions: ArrayLike, rounding: float = 0.0) -> bool:
@@ -189,7 +187,7 @@ class Space:
 
     @property
     def faces(self) -> tuple[str, ...]:
-        """Return what people call each of the 6 + K faces: "the wall x = 2 m", "the obstacle 'table'"."""
+        """Return the name of each of the 6 + K faces in messages: "the wall x = 2 m", "the obstacle 'table'"."""
         named = (
             f"the obstacle {each.name!r}" if each.name else f"obstacle {number}"
             for number, each in enumerate(self.obstacles, start=1)
@@ -222,7 +220,7 @@ class _Prisms(NamedTuple):
 
 @lru_cache(maxsize=8)
 def _prisms(obstacles: tuple[Obstacle, ...]) -> _Prisms:
-    """Return obstacles in one form, of which a box has no radius, and of a cylinder the rectangle is a point."""
+    """Return obstacles in one form: a box has radius 0, and the rectangle of a cylinder is a point."""
     table = np.array([each.prism for each in obstacles])
     return _Prisms(table[:, :3], table[:, 3:6], table[:, 6], np.cos(table[:, 7]), np.sin(table[:, 7]))
 
@@ -238,22 +236,22 @@ def _offsets(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> tuple[N
 
 
 def _joined(a: NDArray, b: NDArray) -> NDArray:
-    """Return the distance from a corner whose two sides are so far away: Euclidean outside, to the nearer inside."""
+    """Return the distance from a corner by those from its two sides: Euclidean outside, the nearer side's inside."""
     return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0)
 
 
 def _distances(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> NDArray:
     """Return the signed distance, m, of points, (..., 1, 3) or (..., K, 3), from each prism, (..., K).
 
-    It is a convex function of the place. `half` is half the size of boxes about the points, whose distance it is; from
-    a turned prism at most their distance.
+    It is a convex function of the position. With `half`, half the size of boxes about the points, it is the distance of
+    the boxes, or less if the prism is turned.
     """
     _, over = _offsets(prisms, points, half)
     return _joined(_joined(over[..., 0], over[..., 1]) - prisms.radius, over[..., 2])
 
 
 def _near(prisms: _Prisms, points: NDArray, half: NDArray) -> NDArray:
-    """Return the numbers of the prisms among which the nearest of each point, (N, 3), is."""
+    """Return the numbers of the prisms that may be the nearest to one of the points, (N, 3)."""
     low, high = (points - half).min(axis=0), (points + half).max(axis=0)
     reach = float(np.linalg.norm(high - low)) / 2
     away = _distances(prisms, (low + high) / 2)
@@ -261,7 +259,7 @@ def _near(prisms: _Prisms, points: NDArray, half: NDArray) -> NDArray:
 
 
 def _distances_with_slopes(prisms: _Prisms, points: NDArray) -> tuple[NDArray, NDArray]:
-    """Return signed distances, and their slope by place, (..., K, 3): of a corner, that of one of its sides."""
+    """Return signed distances and their gradients, (..., K, 3); at a corner, the gradient of one side."""
     own, over = _offsets(prisms, points)
     sign = np.sign(own)
     flat, to_sides = _slope(over[..., 0], over[..., 1])
@@ -307,7 +305,7 @@ def distances_beyond(path: Path, space: Space) -> tuple[NDArray, NDArray]:
     """Return s, (M, N), along each of the M pieces, and how far the path is beyond the space around there, (M, N) m.
 
     The distance is that of the worst face less its margin, negative inside. It holds between the samples too, where a
-    coordinate exceeds both by at most step² / 8 of its second derivative; s is where about it is the worst.
+    coordinate exceeds both by at most step² / 8 of its second derivative; s is about where it is worst.
     """
     s = _samples(path)
     places, bend = path(s), np.abs(path(s, 2)).max(axis=1)
@@ -328,9 +326,9 @@ class _Stretches(NamedTuple):
     piece: NDArray  # (C,) int
     obstacle: NDArray  # (C,) int
     ends: NDArray  # (C, 2): s
-    least: NDArray  # (C,) m, how far it is beyond that obstacle less its margin somewhere
-    most: NDArray  # (C,) m, how far it is so at most
-    worst: NDArray  # (C,) about the s where it is
+    least: NDArray  # (C,) m, lower bound on how far it comes beyond that obstacle less its margin
+    most: NDArray  # (C,) m, upper bound on the same
+    worst: NDArray  # (C,) s, about where it is worst
 
     def some(self, which: NDArray) -> "_Stretches":
         """Return some of them."""
@@ -344,9 +342,9 @@ def _samples(path: Path) -> NDArray:
 
 @lru_cache(maxsize=16)
 def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
-    """Return s, (M, N), and at most how far the path is beyond an obstacle less its margin around there, (M, N) m.
+    """Return s, (M, N), and a bound on how far the path is beyond an obstacle less its margin around there, (M, N) m.
 
-    As distances_beyond(), of a space that has obstacles. Along a chord of the path a distance is convex, so it is
+    Like distances_beyond(), for a space that has obstacles. Along a chord of the path a distance is convex, so it is
     nowhere below its tangents at both ends, and the path is no farther from the chord than step² / 8 of its second
     derivative. Where that does not decide, a stretch is cut into shorter ones.
     """
@@ -357,7 +355,7 @@ def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
     around = np.linalg.norm(places - middle[:, None], axis=-1).max(axis=1)
     around += (np.diff(path.breaks) / (count - 1)) ** 2 / 8 * bend
     seen = space.margin - _distances(prisms, middle[:, None])
-    most = seen + around[:, None]  # as a distance changes by no more than the place
+    most = seen + around[:, None]  # a distance changes by no more than the position does
     close = ~(most <= min(seen.max(), 0.0))
     at = s.copy()
     beyond = np.repeat(np.where(close, -np.inf, most).max(axis=1)[:, None], count, axis=1)
@@ -415,7 +413,7 @@ def _cut(
 
 
 def _raise(at: NDArray, beyond: NDArray, stretches: _Stretches) -> None:
-    """Write what stretches say into `beyond`, (M, N) m, where it is more, and `at`, (M, N) s."""
+    """Raise `beyond`, (M, N) m, to the bounds of stretches where these are larger, and set `at`, (M, N) s, there."""
     order = np.argsort(stretches.most)  # of several for one cell the last one stays
     cell, most = stretches.cell[order], stretches.most[order]
     more = most > beyond.ravel()[cell]

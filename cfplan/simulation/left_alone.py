@@ -7,7 +7,7 @@ acceleration, m/s², and a speed to a side, m/s. The bodies after the setpoint, 
 which goes on alone and those of the ones that fall.
 
 Where obstacles matter, the sweep is cut into several boxes, each for PART s after the setpoint and the last for the
-rest: one box about a way aslant holds much that the vehicle does not come to.
+rest: one box around a diagonal way holds much that the vehicle never reaches.
 """
 
 import numpy as np
@@ -56,7 +56,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import axes_of
 
 PUSH, DAMPING, LIFT, DRIFT = range(4)  # as what the vehicle has wrong is packed
-PART = 0.15  # s of a sweep, for which a box is its own
+PART = 0.15  # s of a sweep in one box
 _LONGEST = 4.0  # s that are simulated after the last setpoint, unless the vehicle lies on the floor before
 _SETTLED_AFTER = 0.5  # s of level-out, after which a vehicle that hardly turns has settled
 _SETTLED_RATE = 0.2  # rad/s, below which it hardly turns
@@ -95,7 +95,7 @@ def leave_alone_in_stops(
 ) -> None:
     """Fly stops, (K, M, 20), each from a snapshot, (K, 31); leave the vehicle alone where `forks`, (K, M), says so.
 
-    Written are the boxes, (F, S, 2, 3), of one fork after another.
+    Write the boxes, (F, S, 2, 3), of one fork after another.
     """
     length = stops.shape[1]
     snapshots, setpoints = np.empty((WIDTH * length, SNAPSHOT_SIZE)), np.empty((WIDTH * length, SETPOINT_SIZE))
@@ -157,7 +157,7 @@ def leave_alone(
 ) -> None:
     """Write the boxes, (F, S, 2, 3), that vehicles sweep from snapshots, (F, 31), with their last setpoints, (F, 20).
 
-    Each is of a part of the time, and all hold something.
+    Each box is of one part of the time, and none is empty.
     """
     panel, spare, which = new_panel(), np.empty((WIDTH, SNAPSHOT_SIZE)), np.empty(WIDTH, dtype=np.int64)
     the_gains = unpacked_gains(gains)
@@ -219,7 +219,7 @@ def _widen_parts(
 ) -> None:
     """Make the box of each vehicle hold its place, and all `astray`, m, to its sides.
 
-    Where part `after` begins, its box does too, and is the one in the panel from then on.
+    Where part `after` begins, its box replaces the one in the panel.
     """
     _widen(panel, whole(lanes), astray)
     if after != part:

@@ -82,11 +82,9 @@ class LinkLossMoments:
 
     time: NDArray  # (N,) s of each setpoint from the first
     place: NDArray  # (N, 3) m, of each setpoint
-    boxes: (
-        NDArray  # (N, S, 2, 3) m, low and high corners of what the vehicle sweeps from there to the floor, in S parts
-    )
+    boxes: NDArray  # (N, S, 2, 3) m, low and high corners of what the vehicle sweeps down to the floor, in S parts
     beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
-    face: NDArray  # (N,) int, which of the faces of the space that is, or which it comes nearest to
+    face: NDArray  # (N,) int, the number of that face of the space, or of the nearest one
     distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
     snapshots: NDArray  # (L, N, 31) as in `branching`, at each setpoint, for each motor lag; (L, 0, 31) within stops
 
@@ -339,13 +337,13 @@ def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, 
 
 
 def _united(boxes: list[NDArray]) -> NDArray:
-    """Return the boxes, (N, S, 2, 3), that hold those of each of a list."""
+    """Return boxes, (N, S, 2, 3), that enclose the corresponding ones of a list."""
     low, high = np.min([each[:, :, 0] for each in boxes], axis=0), np.max([each[:, :, 1] for each in boxes], axis=0)
     return np.stack([low, high], axis=2)
 
 
 def _parts(limits: Limits) -> int:
-    """Return how many boxes a sweep is cut into: for walls one tells as much."""
+    """Return how many boxes a sweep is cut into; one suffices for walls."""
     return _PARTS if limits.space.obstacles else 1
 
 

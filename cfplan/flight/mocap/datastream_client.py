@@ -126,7 +126,7 @@ def open_connection(host: str, port: int, where: str, hint: str) -> socket.socke
 
 
 def address_of(host: str, port: int, where: str) -> str:
-    """Return the address of a computer in numbers, of version 4 if it has one. Raises InputError on an unknown name."""
+    """Return the numeric address of a computer, IPv4 if it has one. Raises InputError for an unknown name."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     except (socket.gaierror, UnicodeError) as why:

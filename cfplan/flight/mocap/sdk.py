@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import motioncapture
 
 _SCENE_TIMEOUT = 0.5  # s to hear of the subjects
-_NAMES = {"vicon-sdk": "vicon", "optitrack-sdk": "optitrack_closed_source"}  # in the package, where others than ours
+_NAMES = {"vicon-sdk": "vicon", "optitrack-sdk": "optitrack_closed_source"}  # the package's names where they differ
 
 
 class SdkDriver:
@@ -44,7 +44,7 @@ class SdkDriver:
                 where=str(self._uri),
                 hint="pip install 'cfplan[mocap]'" + ("; or use vicon://, which does not need it" * self._is_vicon),
             ) from why
-        address = address_of(self._uri.host, self._uri.port, str(self._uri))  # not every client knows names
+        address = address_of(self._uri.host, self._uri.port, str(self._uri))  # not every client resolves names
         if self._is_vicon:
             self._scene = self._read_scene()
         elif self._uri.system == "qualisys":

@@ -22,7 +22,7 @@ from cfplan.vehicle.airframe import GRAVITY
 
 _LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; moments that are looked at
 _PARTS = tuple(slice(begin, begin + 9) for begin in range(0, _MOMENTS - 1, 8))
-"""Moments of each part of a fall, which has its own box if there are obstacles; the last is the next part's first."""
+"""Moments of each part of a fall; with obstacles each part has its own box. Neighbouring parts share a moment."""
 _G = np.array([0.0, 0.0, GRAVITY])
 
 
@@ -31,8 +31,8 @@ class Falls:
     """Where the vehicle falls from each of N states, motors off."""
 
     beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
-    face: NDArray  # (N,) int, which of the faces of the space that is, or which it comes nearest to
-    reach: NDArray  # (N,) m, towards that wall, from where it is; aside if it is an obstacle
+    face: NDArray  # (N,) int, the number of that face of the space, or of the nearest one
+    reach: NDArray  # (N,) m, how far it moves towards that wall; horizontally if it is an obstacle
     distance: NDArray  # (N,) m, horizontally, to the far corner of the box that it sweeps
 
     @property

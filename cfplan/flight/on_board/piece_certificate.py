@@ -93,7 +93,7 @@ def certify_pieces(pieces: Pieces, airframe: Airframe, limits: PlanLimits, space
 
 
 def _path_of(pieces: Pieces) -> Path:
-    """Return the way of the pieces, by time."""
+    """Return the pieces as a path over time."""
     durations = pieces.durations.astype(float)
     table = pieces.coefficients[:, :3].astype(float).swapaxes(1, 2)
     table[-1:] = shifted(table[-1:], durations[-1:])  # of a path, the last piece is expanded about its end
@@ -101,7 +101,7 @@ def _path_of(pieces: Pieces) -> Path:
 
 
 def certify_samples(samples: Samples, airframe: Airframe, limits: PlanLimits) -> Certificate:
-    """Return the certificate of samples, without walls and obstacles; what is not a number fails."""
+    """Return the certificate of samples, without walls and obstacles; a value that is not a number fails."""
     measured = measures_along(samples, airframe)
     margins = []
     for quantity in QUANTITIES:

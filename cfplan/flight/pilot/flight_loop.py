@@ -257,7 +257,7 @@ class FlightLoop:
                 position, velocity, yaw = estimate.position, estimate.velocity, yaw_of(estimate.quaternion)
         (x, y, z), rate = position, self.mission.rate
         place = _between_walls((x + _BRAKES_IN * velocity[0], y + _BRAKES_IN * velocity[1], z), space)
-        if space.obstacles and not space.holds(place):  # rather where it is than in an obstacle ahead
+        if space.obstacles and not space.holds(place):  # stay here rather than enter an obstacle ahead
             place = _between_walls((x, y, z), space)
         motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
         self.begin(Stream(encode_motion(motion, motion.acceleration, gains_under(self.limits), space=space), rate))
@@ -558,7 +558,7 @@ def committed(time: float, splice: int, checksum: int, payloads: NDArray) -> Pla
 
 
 def _between_walls(place: Triple, space: Space) -> Triple:
-    """Return the place nearest to one, m, that keeps the margin from walls and ceiling."""
+    """Return the nearest place, m, that keeps the margin from walls and ceiling."""
     low, high = np.add(space.low, space.margin).tolist(), np.subtract(space.high, space.margin).tolist()
     x, y, z = place
     return min(max(x, low[0]), high[0]), min(max(y, low[1]), high[1]), min(z, high[2])

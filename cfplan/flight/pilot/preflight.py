@@ -29,8 +29,8 @@ from cfplan.vehicle.rotations import tilt_of, yaw_of
 OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
-_WAY_STEP = 0.01  # m, between the places that are looked at on the way to the start
-LARGEST_HEIGHT = 0.3  # m of the tracked body from the floor: a box may be as high
+_WAY_STEP = 0.01  # m, between the places that are checked on the way to the start
+LARGEST_HEIGHT = 0.3  # m, of the tracked body above the floor: the vehicle may stand on a box
 LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors lean by less
 
 
@@ -244,7 +244,7 @@ def check_tilt(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_height(snapshot: PreflightSnapshot) -> Check:
-    """A body that was defined where it stands is level with any axis up; its height shows which one is."""
+    """A body defined where it stands is level in any frame; its height shows whether z is up."""
     height = snapshot.poses[-1].position[2] - snapshot.mission.limits.space.low[2]
     return Check(
         "height of the body", f"{shown(height, '.2f')} m above the floor", f"within {LARGEST_HEIGHT:.1f} m",
@@ -276,7 +276,7 @@ def check_start_place(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_way_to_start(snapshot: PreflightSnapshot) -> Check:
-    """Between the vehicle's take-off and the start no obstacle stands, nor beneath, where link loss would end."""
+    """No obstacle stands on the way from take-off to the start, or beneath it, where link loss would end."""
     mission, limits = snapshot.mission, snapshot.mission.limits
     space, (x, y, _), (start, _) = limits.space, snapshot.poses[-1].position, mission.start
     name, threshold = "way to the start", "clear of obstacles by the margin, and so what is beneath"

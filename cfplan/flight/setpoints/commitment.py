@@ -332,7 +332,7 @@ def _wrong(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_stop: boo
     chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0
     if not worst.jump <= _JUMP + chords:
         return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
-    # Between walls the outermost corners tell all; obstacles stand between them.
+    # The outermost corners suffice for walls, but not for obstacles, which may stand between them.
     places = positions_of(runs).reshape(-1, 3) if limits.space.obstacles else worst.corners
     beyond = limits.space.farthest(places)
     if not inside(beyond, QUANTUM):

@@ -13,7 +13,7 @@ This matters once setpoints stop: the firmware then wants a level attitude, yet 
 settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
 which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally,
 as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from that wall,
-the more the nearer, so that an attitude that the vehicle has wrong does not carry it there; from an obstacle likewise.
+the more the nearer, so that an error of its attitude does not carry it there; it leans away from obstacles as well.
 How much depends on how long level-out lasts until the motors stop (LevelOut).
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
@@ -227,7 +227,7 @@ def _walls(space: Space | None) -> NDArray:
 
 
 def _off_obstacles(motion: FullStateSetpoints, space: Space | None, goal: LevelOut) -> NDArray:
-    """Return the accelerations, (N, 2) m/s², away from obstacles, as far as those of a wall so near would be."""
+    """Return the accelerations, (N, 2) m/s², away from obstacles, as large as from a wall at the same distance."""
     if space is None or not space.obstacles:
         return np.zeros((len(motion.position), 2))
     soon = np.array(motion.position, dtype=float)
@@ -238,9 +238,10 @@ def _off_obstacles(motion: FullStateSetpoints, space: Space | None, goal: LevelO
 
 @njit(error_model="numpy")
 def _pushed_off(place: NDArray, prisms: NDArray, level_out: NDArray) -> NDArray:
-    """Return what _off_obstacles() does. What is above a vehicle counts as so much farther, what is beneath as beside.
+    """Return the accelerations of _off_obstacles().
 
-    It comes down there. Accelerations of several obstacles add up, at most to that of one.
+    The height of an obstacle above the vehicle adds to its distance; one beneath counts as beside, since the vehicle
+    comes down there. Accelerations of several obstacles add up, at most to that of one.
     """
     out = np.zeros((len(place), 2))
     reach, stiffness, pull_max = level_out[2], level_out[3], level_out[4]

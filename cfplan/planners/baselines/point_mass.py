@@ -1,4 +1,4 @@
-"""The soonest flight of a point mass through waypoints: what no vehicle with these limits beats.
+"""The fastest flight of a point mass through waypoints: a time that no vehicle with these limits beats.
 
 The point mass keeps the limits on speed and acceleration; it has no attitude and no motors, and knows no walls.
 Accelerations are constant within equal parts of each segment, so that its motion follows exactly from them; finer

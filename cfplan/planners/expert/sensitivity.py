@@ -1,9 +1,9 @@
-"""How the flight time changes with the path.
+"""The gradient of the flight time by the path.
 
-At an optimum the flight time changes with the data of its problem as the Lagrangian does while profile and multipliers
-stay (the envelope theorem). The path enters the Lagrangian by γ' to γ'''' at the problem's points alone: the kernels
-evaluate it there once for each of these twelve numbers moved a little. Where the limit on speed holds, γ' enters by the
-bound on h. What turns with the path, a yaw along it, is taken to stay; penalties count as time, as in the problem.
+At an optimum the flight time changes with the data of its problem as the Lagrangian does at fixed profile and
+multipliers (the envelope theorem). The path enters the Lagrangian by γ' to γ'''' at the problem's points alone; the
+kernels evaluate it there with each of these twelve numbers perturbed. Where the limit on speed is active, γ' enters by
+the bound on h. A yaw along the path is held fixed; penalties count as time, as in the problem.
 """
 
 from typing import NamedTuple
@@ -21,12 +21,12 @@ from cfplan.planners.expert.transcription import OBJECTIVE_SCALE
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.timing import duration_of
 
-_MOVED = 1e-6  # share of the largest value of a derivative of the path, by which it is moved
+_MOVED = 1e-6  # perturbation, as a fraction of the largest value of that derivative of the path
 _STILL = 1e-9  # |γ'|² below which the path stands still
 
 
 class Sensitivity(NamedTuple):
-    """The flight time along a path, and how it changes with the path."""
+    """The flight time along a path, and its gradient by the path."""
 
     duration: float  # s, within about 1 %: limits hold at the points of the grid only
     s: NDArray  # (P,) places along the path
@@ -35,9 +35,9 @@ class Sensitivity(NamedTuple):
 
 
 def sensitivity(task: PlanningTask, near: NDArray | None = None) -> Sensitivity | None:
-    """Return how the flight time of a task changes with its path, by one search for the profile; None if it fails.
+    """Return the flight time of a task and its gradient by the path, from one search for the profile; None if it fails.
 
-    `near` are coefficients of a path almost the same, which save half of the iterations.
+    `near` are the coefficients of a similar path's profile, which save half of the iterations.
     """
     if task.refusal:
         return None
@@ -68,14 +68,14 @@ def _by_path(problem: Problem, attempt: Attempt, path: Path) -> tuple[NDArray, N
 
 
 def _by_point_data(problem: Problem, attempt: Attempt, multipliers: NDArray) -> NDArray:
-    """Return how the Lagrangian changes with γ' to γ'''' at the points, (4, 3, P)."""
+    """Return the gradient of the Lagrangian by γ' to γ'''' at the points, (4, 3, P)."""
     layout, free_yaw = problem.layout, problem.layout.shape.free_yaw
     points = len(layout.interval)
     local = [attempt.coefficients[layout.interval + k, 0] for k in range(4)]
     if free_yaw:
         local += [attempt.coefficients[layout.interval + k, 1] for k in range(3)]
     moved = _MOVED * np.abs(problem.point_data[:12]).reshape(4, -1).max(axis=1).repeat(3)
-    data = np.repeat(problem.point_data[:, None], 13, axis=1)  # as it is, and with each of twelve rows moved
+    data = np.repeat(problem.point_data[:, None], 13, axis=1)  # unchanged, and with each of twelve rows perturbed
     data[np.arange(12), np.arange(1, 13)] += moved[:, None]
     kernels = kernels_at_hand()(
         free_yaw, data.reshape(len(data), -1), problem.common, OBJECTIVE_SCALE * problem.penalties, 0

@@ -1,3 +1,3 @@
-"""The path through waypoints that is flown soonest."""
+"""The choice of the fastest path through waypoints."""
 
 __all__ = ["choice"]

@@ -1,4 +1,4 @@
-"""The path through waypoints that is flown soonest.
+"""The choice of the fastest path through waypoints.
 
 A path of least snap is shaped by the times of its segments and by points between the waypoints: with times like the
 straight lengths it swings far out where these differ. Both are chosen so that the flight time is least, by descending
@@ -29,7 +29,7 @@ CERTIFYING = 0.2  # of the time for choosing, kept for certifying what was found
 
 
 class FastestPath(NamedTuple):
-    """A path through waypoints, and what choosing it was worth."""
+    """A chosen path through waypoints, its flight time, and that along min-snap."""
 
     path: Path
     duration: float  # s, of the certified flight at full speed; infinite where there is none
@@ -38,7 +38,7 @@ class FastestPath(NamedTuple):
     finished: bool  # whether the search ended before the deadline
 
     def describe(self, speed_factor: float) -> str:
-        """Return what the choice was worth, at a factor of the full speed."""
+        """Return the time along min-snap at a factor of the full speed, and whether the choice was cut short."""
         flown = self.min_snap < math.inf
         beside = f"{self.min_snap / speed_factor:.2f} s along min-snap" if flown else "min-snap cannot be flown"
         return beside if self.finished else f"{beside}, choosing was cut short by the budget"
@@ -47,7 +47,7 @@ class FastestPath(NamedTuple):
 def chosen_path(
     path_file: PathFile, limits: Limits, *, budget: float | None = None, models: tuple[pathlib.Path, ...] = ()
 ) -> tuple[PathFile, FastestPath | None]:
-    """Return the path file with the path that its shape asks for, and what the choice was worth if there was one.
+    """Return the path file with the path that its shape asks for, and the choice, if one was made.
 
     Choosing takes at most half of the budget of planning, s; None is that of the path of least snap.
 

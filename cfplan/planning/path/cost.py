@@ -45,7 +45,7 @@ class PathCost:
     reserve: float = 0.0  # m, that is kept inside
     nodes: int = field(init=False)  # of the grid, the same for all paths
     near: NDArray | None = field(default=None, init=False)  # coefficients of the last profile
-    best: NDArray | None = field(default=None, init=False)  # x of the soonest flown path inside the room so far
+    best: NDArray | None = field(default=None, init=False)  # x of the fastest path inside the room so far
     least: float = field(default=math.inf, init=False)  # s, its flight time
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class PathCost:
         return np.searchsorted(ends, s, side="right")
 
     def _backwards(self, knots: Knots, path: Path) -> tuple[float, NDArray, NDArray]:
-        """Return what passing gates backwards costs, s, its gradient by γ' there, (5, 3, G), and the gates' s, (G,)."""
+        """Return the cost of passing gates backwards, s, its gradient by γ' there, (5, 3, G), and their s, (G,)."""
         regions = zip(knots.waypoint, self.path_file.regions, strict=True)
         gates = [(point, region.forwards) for point, region in regions if isinstance(region, Gate)]
         gates = [(point, forwards) for point, forwards in gates if 0 < point < len(knots.times)]

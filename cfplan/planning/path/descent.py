@@ -1,4 +1,4 @@
-"""Descend to a minimum by L-BFGS: a few dozen evaluations of a cost that may fail, until a deadline."""
+"""Minimisation by L-BFGS of a cost that may fail, in a few dozen evaluations, until a deadline."""
 
 import math
 from collections.abc import Callable
@@ -26,7 +26,7 @@ class Descended(NamedTuple):
 
 
 def descend(cost: Cost, x: NDArray, deadline: Deadline, *, tolerance: float, iterations: int) -> Descended:
-    """Descend from x, (n,), until two steps in a row improve the cost by less than a share of it, `tolerance`."""
+    """Descend from x, (n,), until two steps in a row improve the cost by less than a fraction, `tolerance`."""
     value, gradient = cost(x)
     steps: list[NDArray] = []
     changes: list[NDArray] = []

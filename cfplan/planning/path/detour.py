@@ -1,4 +1,4 @@
-"""Where the straight way between two waypoints is blocked, the corners of a short way around.
+"""Corners of a short way around obstacles, where the straight way between two waypoints is blocked.
 
 The way is the shortest on a grid of the free space, and leaves out every corner past which the next one is in sight.
 It is where the search for a path begins, and decides on which side obstacles are passed.

@@ -1,4 +1,4 @@
-"""What a chosen path keeps clear of: walls, obstacles, and the sides of a corridor along its straight lines."""
+"""The room of a chosen path: walls, obstacles, and the sides of a corridor along its straight lines."""
 
 from dataclasses import dataclass, replace
 
@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from cfplan.safety.space import SIDES, Box, Obstacle, Space
 
-_BESIDE = 0.15  # m, by which more than the margin obstacles are kept from where link loss must end clear of them
-_MOVED = 1e-6  # m, to find in which direction a position lies further inside
+_BESIDE = 0.15  # m, added to the margin of obstacles where link loss must end clear of them
+_MOVED = 1e-6  # m, step of finite differences
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,12 +18,12 @@ class Room:
     space: Space
     waypoints: NDArray  # (K, 3) m
     corridor: float | None  # m
-    beside: float = 0.0  # m, by which more than the margin obstacles are kept from, as far as that can be
+    beside: float = 0.0  # m, added to the margin of obstacles where possible
 
     def to_come_down(self) -> "Room":
         """Return the room for a vehicle that must come down clear of obstacles wherever it loses link.
 
-        Obstacles reach from the floor to the ceiling, but those that a waypoint is above, beneath or too near to.
+        Obstacles reach from the floor to the ceiling, except those that a waypoint is above, beneath or too near to.
         """
         columns = []
         for each in self.space.obstacles:
@@ -40,7 +40,7 @@ class Room:
     def aside(self, positions: NDArray, leg: NDArray) -> NDArray:
         """Return how far positions, (P, 3) m, are outside the corridor, (P,) m; negative inside.
 
-        `leg`, (P,), is which straight line each belongs to; the one before and the one behind count too.
+        `leg`, (P,), is the number of the straight line of each; the lines before and after it count too.
         """
         lines = np.clip(leg[:, None] + [-1, 0, 1], 0, len(self.waypoints) - 2)
         begin, step = self.waypoints[lines], self.waypoints[lines + 1] - self.waypoints[lines]
@@ -50,7 +50,7 @@ class Room:
         return np.asarray(aside - (np.inf if self.corridor is None else self.corridor))
 
     def penalty(self, positions: NDArray, leg: NDArray, reserve: float) -> tuple[float, NDArray]:
-        """Return the sum of squares, m², by which positions come nearer than `reserve`, m, and its gradient, (P, 3) m.
+        """Return the sum of squares of what positions lack to a `reserve`, m, in m², and its gradient, (P, 3) m.
 
         `positions` is (P, 3) m.
         """

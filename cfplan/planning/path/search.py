@@ -1,4 +1,4 @@
-"""The search for the path through waypoints that is flown soonest: where it starts, and how it is kept in the room."""
+"""The search for the fastest path through waypoints: where it starts, and how it is kept in the room."""
 
 import math
 from typing import NamedTuple
@@ -19,11 +19,11 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 
 TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps improve it at last; steps at most
-ROUGHLY = 0.01  # the same of a first descent, by the length of the path
+LOOSE_TOLERANCE = 0.01  # the same of a first descent, by the length of the path
 # Weights of what leaves the room, s/m³: each descent that ends outside is followed by one with the next weight, which
 # keeps further inside by what was missed.
 WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
-RESERVE = 0.002  # m, that is kept inside besides what was missed
+RESERVE = 0.002  # m, kept inside beyond what was missed
 
 
 class ChosenKnots(NamedTuple):
@@ -36,7 +36,7 @@ class ChosenKnots(NamedTuple):
 
 
 def timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
-    """Return points with times like their straight lengths, and with centripetal ones; `waypoint` of them are such."""
+    """Return points with times like their straight lengths, and with centripetal ones; `waypoint` numbers waypoints."""
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     centripetal = centripetal_times(points)
     return Knots(lengths, points, waypoint), Knots(centripetal * (lengths.sum() / centripetal.sum()), points, waypoint)
@@ -59,7 +59,7 @@ def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKno
 
 
 def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
-    """Return the best from the better of two timings."""
+    """Return the best that descent finds from the better of two timings."""
     starts = [_started(path_file, knots) for knots in timed(*with_corners(path_file.waypoints, room.space))]
     costs = []
     for start in starts:
@@ -68,7 +68,7 @@ def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadli
     cost = min(costs, key=lambda each: each(each.variables.first)[0])
     x = cost.variables.first
     if not inside(cost.missed(x)):
-        x, _ = _descend_inside(cost, cost.by_length, x, ROUGHLY, deadline)
+        x, _ = _descend_inside(cost, cost.by_length, x, LOOSE_TOLERANCE, deadline)
     x, finished = _descend_inside(cost, cost, x, TOLERANCE, deadline)
     x = x if cost.best is None else cost.best
     return ChosenKnots(cost.variables.knots(x), cost.missed(x), cost.aside(x), finished)
@@ -91,7 +91,7 @@ def _descend_inside(
 
 
 def _started(path_file: PathFile, knots: Knots) -> Knots:
-    """Return where a search starts: with a point between each two, which leads into gates forwards."""
+    """Return the knots at which a search starts: with a point between each two, which leads into gates forwards."""
     knots = with_points_between(knots)
     for point, region in zip(knots.waypoint, path_file.regions, strict=True):
         if isinstance(region, Gate):

@@ -1,4 +1,4 @@
-"""What is chosen of a path through waypoints: segment times, points between waypoints, and points within regions.
+"""The variables of a chosen path: segment times, points between waypoints, and points within regions.
 
 All variables are free of bounds. A segment time is an exponential; where a point may move within a ball or a gate, the
 variables are mapped onto it by q / √(1 + q²) (after Wang et al., 2022). All laps share their variables.
@@ -23,7 +23,7 @@ class Knots(NamedTuple):
 
     times: NDArray  # (M,) s
     points: NDArray  # (M+1, 3) m
-    waypoint: NDArray  # (K,) which of the points are the waypoints
+    waypoint: NDArray  # (K,) the numbers of the waypoints among the points
 
     @property
     def path(self) -> Path:
@@ -33,13 +33,13 @@ class Knots(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChoiceVariables:
-    """The variables of a choice, x, (n,), and the way from them to times and points, and of gradients back."""
+    """The variables of a choice, x, (n,), the map from them to times and points, and the way back for gradients."""
 
     start: Knots  # where all variables but those of times are 0
     axes: NDArray  # (P, 3, 3) m, rows: along which each point of a lap may move
     bounded: NDArray  # (P,) 0 where it moves without bounds, 1 within a ball, 2 within a box
-    time_of: NDArray  # (M,) which variable each segment's time is
-    point_of: NDArray  # (M+1,) which point of the lap each point is
+    time_of: NDArray  # (M,) the number of each segment's variable
+    point_of: NDArray  # (M+1,) the number of each point within its lap
     moving: NDArray  # (Q,) the points of a lap that may move
 
     @property
@@ -56,7 +56,7 @@ class ChoiceVariables:
         return self.start._replace(times=self._times(x), points=points)
 
     def gradient(self, x: NDArray, by_times: NDArray, by_points: NDArray) -> NDArray:
-        """Return the gradient by the variables of what changes so with times, (M,), and points, (M+1, 3)."""
+        """Return the gradient by the variables, from those by times, (M,), and by points, (M+1, 3)."""
         times = self._times(x)
         by_logs = times * (by_times - by_times @ times / times.sum()) * TIME_UNIT
         of_lap = np.zeros((len(self.axes), 3))
@@ -71,7 +71,7 @@ class ChoiceVariables:
         return np.asarray(times * (self.start.times.sum() / times.sum()))
 
     def _offsets(self, x: NDArray) -> tuple[NDArray, NDArray]:
-        """Return how far the points of a lap moved, (P, 3) m, and how that changes with their variables, (Q, 3, 3)."""
+        """Return how far the points of a lap moved, (P, 3) m, and the derivatives by their variables, (Q, 3, 3)."""
         q = x[int(self.time_of.max()) + 1 :].reshape(-1, 3)
         axes, bounded = self.axes[self.moving], self.bounded[self.moving, None]
         squares = np.where(bounded == 1, (q**2).sum(axis=1, keepdims=True), q**2) * (bounded > 0)

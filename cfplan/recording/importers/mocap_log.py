@@ -101,7 +101,7 @@ def attitude(channels: Table) -> NDArray:
 
 
 def without_zeros(table: Table, columns: Columns) -> Table:
-    """Return the columns with NaN in each row whose position is unknown, or which holds zeros alone: not seen."""
+    """Return the columns, with NaN in each row where the body was not seen: without a position, or all zeros."""
     values = np.stack([table[key] for key, _ in columns.values()])  # the position first
     values[:, np.isnan(values[:3]).any(axis=0) | (values == 0).all(axis=0)] = np.nan
     return {"t": table["t"], **dict(zip((key for key, _ in columns.values()), values, strict=True))}

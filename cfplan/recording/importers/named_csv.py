@@ -49,14 +49,14 @@ def _pose(place: str, turn: str) -> Columns:
 
 
 LAYOUTS: dict[str, tuple[float, Mapping[str, Columns]]] = {
-    # format: the unit of its times in s, if the header names none, and each subject's columns; "" is called as the file
+    # format: the unit of its times in s, if the header names none, and each subject's columns; "" is the file's name
     "CSV of t, x, y, z": (1.0, {"": POSE}),
     "CSV of t, p_x, p_y, p_z": (1.0, {"": _pose("p_?", "q_?")}),
     "TUM trajectory": (1.0, {"": _pose("t?", "q?")}),
     "EuRoC ground truth": (1e-9, {"": _pose("p_rs_r_?", "q_rs_?")}),
     "cfclient log": (1e-3, {s: {c: (key.lower(), unit) for c, (key, unit) in SOURCES[s].items()} for s in SOURCES}),
 }
-_UNNAMED = {4: ("t", *PLACE), 8: ("t", "tx", "ty", "tz", *QUATERNION)}  # the columns if no line names so many
+_UNNAMED = {4: ("t", *PLACE), 8: ("t", "tx", "ty", "tz", *QUATERNION)}  # columns without names, by their number
 _MOTIVE: Columns = {  # the axis that Motive exports as y is up: its z is -y here
     "x": ("Position X", 1.0), "y": ("Position Z", -1.0), "z": ("Position Y", 1.0),
     "qx": ("Rotation X", 1.0), "qy": ("Rotation Z", -1.0), "qz": ("Rotation Y", 1.0), "qw": ("Rotation W", 1.0),
@@ -77,12 +77,12 @@ class _Head:
     time: int = -1  # the column of the times
     unit: float = 1.0  # of the times, s
     rate: float = math.nan  # Hz, of the rows, if no column holds times
-    zeros: bool = False  # stand for a body that was not seen
+    zeros: bool = False  # whether rows of zeros stand for a body that was not seen
     notes: tuple[str, ...] = ()
 
 
 def read(file: Path) -> MocapLog:
-    """Read every subject; one without a name of its own is named after the file.
+    """Read every subject; an unnamed one is named after the file.
 
     Raises InputError if a column is missing, a unit is unknown, or a cell is not a number.
     """
@@ -96,7 +96,7 @@ def read(file: Path) -> MocapLog:
     delimiter = max("\t;,", key=sample.count)
     if delimiter not in sample or (delimiter == "," and re.search(r"\d,\d+ +[-\d]", first)):  # or decimal commas
         delimiter = " "
-    if delimiter == " ":  # any number of them
+    if delimiter == " ":  # several count as one
         data = data[:begin] + b"\n".join(b" ".join(line.split()) for line in data[begin:].splitlines())
         first = " ".join(first.split())
     where, cells = f"{file}:{max(line_at(data, begin) - 1, 1)}", first.split(delimiter)
@@ -128,7 +128,7 @@ def _head(lines: Sequence[str], row: Sequence[str], delimiter: str, where: str) 
 
 
 def _named(line: str, row: Sequence[str], delimiter: str, where: str) -> _Head:
-    """Return the columns that the line names; or those of a file whose columns are not named."""
+    """Return the columns that the line names, or those of a file without names."""
     text = line.strip().lstrip("#").strip()
     named = [_CELL.fullmatch(cell) for cell in (text.split() or [""] if delimiter == " " else text.split(delimiter))]
     names, units = zip(*((cell[1].lower(), (cell[2] or "").lower()) for cell in named if cell), strict=True)

@@ -42,14 +42,14 @@ _DEFINITIONS = {  # of messages that are not ROS's own; bags of Humble in SQLite
     _NAMED_POSE: "string name\ngeometry_msgs/Pose pose\n",
     f"{_NAMED_POSE}Array": "std_msgs/Header header\nmotion_capture_tracking_interfaces/NamedPose[] poses\n",
 }
-_Message = tuple[str, str, int, Any]  # its topic, its type, when it was received, ns, and its content
+_Message = tuple[str, str, int, Any]  # topic, type, time of receipt in ns, content
 
 
 def read(file: Path) -> MocapLog:
     """Read every pose, named by its topic, or by its own name if a message holds several; times are from headers.
 
-    Frames of transforms are composed up to the one that no transform moves. Of an MCAP file that is damaged or cut off,
-    all complete chunks before that are read.
+    Transforms are composed up to their root frame. A damaged or truncated MCAP file is read up to its last complete
+    chunk.
 
     Raises InputError if the bag is damaged or no message in it holds a pose; ImportError without the extra.
     """
@@ -97,7 +97,7 @@ def read(file: Path) -> MocapLog:
 
 
 def is_bag(place: Path) -> bool:
-    """Return whether a place is a bag to its reader: a file, or a folder with metadata."""
+    """Return whether rosbags reads a place as one bag: a file, or a folder with metadata."""
     return not place.is_dir() or (place / "metadata.yaml").is_file()
 
 
@@ -118,7 +118,7 @@ def _messages(paths: list[Path], types: Any, topics: set[str]) -> Iterator[_Mess
 
 
 def _complete_messages(path: Path, types: Any, topics: set[str]) -> Iterator[_Message]:
-    """Yield the same of an MCAP file in its order, up to where it is damaged."""
+    """Yield the messages of an MCAP file in its order, up to the damage."""
     from mcap.reader import NonSeekingReader
 
     with path.open("rb") as stream, suppress(Exception):
@@ -158,8 +158,8 @@ def _in_root_frame(name: str, tables: Mapping[str, Table], parents: Mapping[str,
 def _composed(parent: Table, child: Table) -> Table:
     """Return poses of `child`, which are in the frame `parent`, in the frame of `parent`'s own poses.
 
-    They are at the times of the child, or of the parent if the child has one alone, as static transforms do; between
-    times and beyond them the other is interpolated or held.
+    Their times are those of the child, or of the parent if the child has a single one, as static transforms do. The
+    other poses are interpolated, and held beyond their ends.
     """
     time = parent["t"] if len(child["t"]) == 1 else child["t"]
     (outer, outer_turn), (inner, inner_turn) = (_at(table, time) for table in (parent, child))

@@ -38,7 +38,7 @@ _PACKET = re.compile(  # length, flags and kind of version 2; length and kind of
 _STAMP = 8  # bytes before each packet
 _SIGNED = 0x01  # of a v2 packet's incompatibility flags: 13 bytes of signature follow
 _LOCAL_FRD = 20
-_GLOBAL_POSITION = 33  # not read, but named where nothing else is there
+_GLOBAL_POSITION = 33  # not read, but named in a note if the log has nothing else
 _LOCAL_POSITION, _ATTITUDE, _ATTITUDE_QUATERNION, _ODOMETRY, _SETPOINT = 32, 30, 31, 331, 85
 _MESSAGES: dict[int, tuple[tuple[str, ...], Callable[[Any], Any]]] = {  # message: channels, and their fields
     _LOCAL_POSITION: (PLACE, attrgetter("x", "y", "z")),

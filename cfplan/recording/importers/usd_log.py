@@ -99,7 +99,7 @@ def _events(data: bytes, file: Path) -> tuple[float, list[tuple[str, NDArray]], 
 
 
 def _blocks(data: bytes, file: Path) -> tuple[float, list[tuple[str, NDArray]], bool]:
-    """Return the same of a log with a header of text. Raises InputError if it is damaged."""
+    """Return the same for a log with a text header. Raises InputError if it is damaged."""
     *variables, _ = data[1:].split(b",", data[0])
     begin, end = 0, 1 + sum(len(variable) + 1 for variable in variables)
     blocks = []
