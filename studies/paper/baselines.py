@@ -1,9 +1,9 @@
 """Make the paper's Table 3: TOPPQuad, networks and the shipped planner compared with planners of other kinds.
 
 TOPPQuad, the paper's networks, the shipped planner and convex TOPP time the min-snap path; scaled min-snap scales the
-path's original timing by one factor. A method like MFBOTrajectory optimises the times of the min-snap segments. A
-learned time allocation, like AllocNet, flies a different path through a corridor around the min-snap path. All plans
-are flown by the geometric controller.
+path's original timing by one factor. The shipped planner also flies the path that it chooses itself. A method like
+MFBOTrajectory optimises the times of the min-snap segments. A learned time allocation, like AllocNet, flies a different
+path through a corridor around the min-snap path. All plans are flown by the geometric controller.
 """
 
 import time
@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
@@ -19,12 +20,14 @@ from numpy.typing import NDArray
 from cfplan.errors import CfplanError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
+from cfplan.geometry.path_file import path_through
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.learning.workers import pool
 from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
+from cfplan.planning.path.choice import fastest_path
 from cfplan.safety.limit_sets import PAPER
 from cfplan.simulation.geometric_flight import fly_geometric, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
@@ -51,14 +54,17 @@ from studies.paper.trials import (
     trajectory_by,
     warm_up,
 )
+from studies.runner.limits import limits_for
 from studies.runner.options import option
 from studies.runner.reductions import among, count, mean
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
 BOX = np.array([10.0, 10.0, 5.0])  # m, sides of the box in which waypoints are drawn
+ENDLESS = 50.0  # m from the middle to walls that no path meets
 NOISES = (0.0, 0.1)  # m, noise injected in training the table's LSTMs
 QUICK_CORRIDORS = 6  # corridors for a quick training of the time allocation
+CHOSEN = "the shipped planner, path chosen"
 SHIPPED, ALLOCATION, CONVEX, MIN_SNAP = "the shipped planner", "AllocNet's kind", "convex TOPP", "scaled min-snap"
 BAYESIAN = "MFBOTrajectory's kind"
 DRAWN, DRAWN_PATHS, DRAWN_POINTS = (SHIPPED, BAYESIAN, ALLOCATION), 3, 121  # the figure's
@@ -147,6 +153,7 @@ def planners(networks: Sequence[TrainedNetwork], allocation: TimeNetwork, budget
         **{each.name: network_plan(each) for each in networks}, SHIPPED: shipped_profile,
     }  # fmt: skip
     return {name: _on_the_path(plan) for name, plan in on_the_path.items()} | {
+        CHOSEN: along_chosen_path,
         ALLOCATION: lambda course: _allotted(course.path, allocation),
         BAYESIAN: lambda course: bayesian_motion(course.waypoints, budget=budget, seed=course.seed),
         CONVEX: _on_the_path(profile_by(plan_convex)),
@@ -171,6 +178,15 @@ def random_course(seed: int) -> Course:
 def _on_the_path(plan: Plan) -> Ask:
     timed = trajectory_by(plan)
     return lambda course: timed(course.path)
+
+
+def along_chosen_path(course: Course) -> Trajectory:
+    """Return the shipped planner's flight along the path that it chooses through the waypoints."""
+    limits = limits_for(FilePath())
+    endless = replace(limits.space, low=(-ENDLESS,) * 3, high=(ENDLESS,) * 3)
+    of_paper = replace(limits, airframe=PAPER.airframe, plan=PAPER.limits, space=endless)
+    chosen = fastest_path(path_through(course.waypoints), of_paper).path
+    return trajectory_by(shipped_profile)(chosen)
 
 
 def _allotted(path: Path, network: TimeNetwork) -> Trajectory:

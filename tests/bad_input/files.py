@@ -121,9 +121,14 @@ def _flights(kind: str, _: Path) -> list[Sound]:
     return found
 
 
-def _yaw_and_place(folder: Path) -> list[Sound]:
+def _waypoints(folder: Path) -> list[Sound]:
     own = b"waypoints: [[0, 0, 1], [1, 0, 1]]\nyaw: {mode: fixed, angle_deg: 3}\nplace: {x: 1}\nspeed: 0.5\n"
-    return [*_flights("waypoints", folder), {"path.yaml": own}]
+    regions = (
+        b"waypoints:\n  - [0, 0, 1]\n  - {at: [1, 0.5, 1], within: 0.1}\n"
+        b"  - {gate: [0, 1, 1], yaw_deg: 180, width: 0.8, height: 0.6}\n  - [0, 0, 1]\nlaps: 2\ncorridor: 0.4\n"
+    )
+    timed = b"waypoints: [[0, 0, 1], [1, 0, 1], [0, 0, 1]]\nshape: min-snap\ntimes: length\n"
+    return [*_flights("waypoints", folder), *({"path.yaml": content} for content in (own, regions, timed))]
 
 
 def _points(_: Path) -> list[Sound]:
@@ -389,7 +394,7 @@ def _use_vicon(folder: Path) -> None:
 
 
 FILES = {
-    "paths": Input(_yaw_and_place, spoil_one_file, _use_path),
+    "paths": Input(_waypoints, spoil_one_file, _use_path),
     "points": Input(_points, spoil_one_file, _use_path),
     "curve": Input(partial(_flights, "curve"), spoil_one_file, _use_path),
     "polynomials": Input(partial(_flights, "polynomials"), spoil_one_file, _use_path),

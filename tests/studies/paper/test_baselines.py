@@ -11,6 +11,7 @@ from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.baselines import (
     ALLOCATION,
     BAYESIAN,
+    CHOSEN,
     CONVEX,
     DRAWN,
     MIN_SNAP,
@@ -32,7 +33,7 @@ def quick():
 def test_every_planner_has_its_row_beside_the_papers(quick):
     rows = {row["planner"]: row for row in quick.table("baselines").rows}
     assert list(rows) == [
-        "TOPPQuad", "expert", "LSTM", "LSTM-0.1", SHIPPED, ALLOCATION, BAYESIAN, CONVEX, MIN_SNAP,
+        "TOPPQuad", "expert", "LSTM", "LSTM-0.1", SHIPPED, CHOSEN, ALLOCATION, BAYESIAN, CONVEX, MIN_SNAP,
     ]  # fmt: skip
     assert rows["TOPPQuad"]["paper_time"] == 5.687
     assert rows[ALLOCATION]["paper_failed"] == 0.28
@@ -40,12 +41,14 @@ def test_every_planner_has_its_row_beside_the_papers(quick):
     assert {name for name in rows if rows[name]["retraining"] is not None} == {"LSTM", "LSTM-0.1", ALLOCATION}
 
 
-def test_all_but_those_that_allot_times_keep_to_the_path(quick):
+def test_all_but_those_that_choose_times_or_paths_keep_to_the_path(quick):
     trials = {trial.planner: trial for trial in quick.rows}
     length = random_course(60_000).path.length
     for name, trial in trials.items():
-        if name not in (ALLOCATION, BAYESIAN):
+        if name not in (ALLOCATION, BAYESIAN, CHOSEN):
             assert trial.length == pytest.approx(length), name
+    assert trials[CHOSEN].travel_time < trials[SHIPPED].travel_time
+    assert trials[CHOSEN].deviation < 0.05
     assert trials[SHIPPED].deviation < 0.05
     assert trials[SHIPPED].violation == 0.0
     assert trials[MIN_SNAP].travel_time > 1.2 * trials[SHIPPED].travel_time
