@@ -65,7 +65,7 @@ class ChosenFlight:
     min_snap: float  # s, along the better path of least snap; NaN where that cannot be flown
     point_mass: float  # s, of a point mass; NaN where that was not computed
     excursion: float  # m, how far the path leads out of the box of the waypoints
-    seconds: float  # to choose the path and certify it
+    seconds: float  # of processor time, to choose the path and certify it
     certified: bool
     refused: str  # why it is not flown; empty if it is
     obstacles: int = 0
@@ -111,13 +111,13 @@ def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> Cho
         path_file = replace(path_file, regions=(None, *(Within(distance) for _ in points[1:-1]), None))
     within = replace(limits, space=_space(how, kind, points, limits.space))
     point_mass = point_mass_time(points, limits.plan) if how in (SETS, TRACK) else None
-    begun = time.perf_counter()
+    begun = time.process_time()
     planned, chosen, refused = None, None, ""
     try:
         planned, chosen = _fly(path_file, within)
     except CfplanError as error:
         refused = error.what
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     excursion = math.nan
     if planned:
         places = planned.path(np.linspace(0.0, planned.path.end, 50 * len(planned.path.breaks)))
@@ -133,13 +133,13 @@ def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> Cho
 def _measure_furnished(seed: int, limits: Limits) -> ChosenFlight:
     """Plan a flight among obstacles, and let it give way for link loss and stops; measure how near it comes to them."""
     space, points = furnished_room(seed, limits.space)
-    begun = time.perf_counter()
+    begun = time.process_time()
     planned, refused, least, lost = None, "", math.nan, ""
     try:
         planned, _ = _fly(path_through(points), replace(limits, space=space))
     except CfplanError as error:
         refused = error.what
-    seconds = time.perf_counter() - begun
+    seconds = time.process_time() - begun
     if planned:
         times = np.arange(0.0, planned.trajectory.duration, 1e-3)
         least = clearance(planned.trajectory.at(times).position, space.obstacles)
