@@ -15,7 +15,7 @@ from cfplan.planning.path.descent import Cost, descend
 from cfplan.planning.path.detour import with_corners
 from cfplan.planning.path.room import Room
 from cfplan.planning.path.variables import Knots, variables_of, with_points_between
-from cfplan.safety.limits import Limits
+from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import inside
 
 TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps improve it at last; steps at most
@@ -23,6 +23,7 @@ LOOSE_TOLERANCE = 0.01  # the same of a first descent, by the length of the path
 # Weights of what leaves the room, s/m³: each descent that ends outside is followed by one with the next weight, which
 # keeps further inside by what was missed.
 WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
+_GENTLY = 0.5  # of the limit on acceleration, with which speeds change in the times that a search begins with
 RESERVE = 0.002  # m, kept inside beyond what was missed
 
 
@@ -42,6 +43,28 @@ def timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
     return Knots(lengths, points, waypoint), Knots(centripetal * (lengths.sum() / centripetal.sum()), points, waypoint)
 
 
+def times_as_flown(points: NDArray, limits: PlanLimits) -> NDArray:
+    """Return about how long the straight lines between points, (K, 3) m, would take, (K-1,) s, from rest to rest.
+
+    Speed falls to the cosine of half the angle by which the lines turn. So points close together on a line, between
+    which the vehicle neither turns nor slows down, do not slow it down in the path's times either.
+    """
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    ahead = steps / lengths[:, None]
+    gain = _GENTLY * limits.acceleration
+    speeds = np.zeros(len(points))
+    speeds[1:-1] = limits.speed * np.sqrt(np.maximum((1.0 + (ahead[1:] * ahead[:-1]).sum(axis=1)) / 2.0, 0.0))
+    for order in (range(len(lengths)), range(len(lengths) - 1, -1, -1)):
+        for k in order:
+            slow, fast = (k, k + 1) if order.step == 1 else (k + 1, k)
+            speeds[fast] = min(speeds[fast], math.sqrt(speeds[slow] ** 2 + 2.0 * gain * lengths[k]))
+    ends = speeds[:-1] ** 2 + speeds[1:] ** 2
+    top = np.minimum(limits.speed, np.sqrt(gain * lengths + ends / 2.0))
+    changing = (2.0 * top**2 - ends) / (2.0 * gain)  # m
+    return np.asarray((2.0 * top - speeds[:-1] - speeds[1:]) / gain + np.maximum(lengths - changing, 0.0) / top)
+
+
 def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
     """Return the best that descent finds of segment times, of waypoints within their regions, and of points between.
 
@@ -59,8 +82,12 @@ def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKno
 
 
 def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
-    """Return the best that descent finds from the better of two timings."""
-    starts = [_started(path_file, knots) for knots in timed(*with_corners(path_file.waypoints, room.space))]
+    """Return the best that descent finds from the best of three timings."""
+    points, waypoint = with_corners(path_file.waypoints, room.space)
+    flown = times_as_flown(points, limits.plan)
+    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    timings = *timed(points, waypoint), Knots(flown * (lengths.sum() / flown.sum()), points, waypoint)
+    starts = [_started(path_file, knots) for knots in timings]
     costs = []
     for start in starts:
         variables = variables_of(start, path_file.regions, path_file.laps, limits.space.margin)

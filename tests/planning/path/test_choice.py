@@ -90,6 +90,12 @@ def test_a_straight_line_stays_straight(limits):
     assert np.linalg.norm(away, axis=1).max() < 0.02
 
 
+def test_many_points_on_a_line_hardly_slow_the_vehicle_down(limits):
+    along = np.array([0.0, 0.02, 0.3, 0.33, 0.35, 0.8, 1.2, 1.21, 1.9, 2.0])
+    points = np.column_stack([along - 1.0, 0.5 * along, np.ones(len(along))])
+    assert choose(points, limits).duration < 1.2 * choose(points[[0, -1]], limits).duration
+
+
 def test_the_same_waypoints_have_the_same_path(limits):
     first, second = (choose(RECTANGLE, limits).path for _ in range(2))
     np.testing.assert_array_equal(first.coefficients, second.coefficients)
