@@ -1,7 +1,5 @@
 """How near the vehicle stays to a fast plan, on what its own filter believes, with poses and packets as in a room."""
 
-from pathlib import Path
-
 import pytest
 from stepped_flight import fly_stepped
 
@@ -13,8 +11,7 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
-
-REPOSITORY = Path(__file__).parents[2]
+from tests.least_snap import along_least_snap
 
 pytestmark = pytest.mark.integration
 
@@ -23,7 +20,7 @@ pytestmark = pytest.mark.integration
     ("path", "after"),
     [*(("slalom", after) for after in (0.0005, 0.0025, 0.0045, 0.0065, 0.0075, 0.0085)), ("random", 0.0075)],
 )
-def test_flights_stay_near_their_plan_whatever_the_beat_of_the_filter(limits, monkeypatch, path, after):
+def test_flights_stay_near_their_plan_whatever_the_beat_of_the_filter(limits, monkeypatch, tmp_path, path, after):
     """The filter predicts every 10 ms, and setpoints and poses are sent `after` s later: that is worth 5 ms.
 
     No clock knows of the other, so one flight in ten is like those at 7.5 ms: poses come just before the next
@@ -37,7 +34,7 @@ def test_flights_stay_near_their_plan_whatever_the_beat_of_the_filter(limits, mo
             self._first += (after - (clock.now() - BEGIN)) % 0.01
 
     monkeypatch.setattr(flight_loop, "Deadlines", Beat)
-    mission, seed = prepare_mission(REPOSITORY / "flights" / f"{path}.yaml", limits), round(1e4 * after)
+    mission, seed = prepare_mission(along_least_snap(path, tmp_path), limits), round(1e4 * after)
     lab = SteppedLab(limits.airframe, vehicle=VehicleSettings(seed=seed), cameras=ViconSettings(seed=seed), seed=seed)
     lab.disturb(RadioFault(RadioFaultKind.LOSS, size=0.05))
     assert fly_stepped(mission, lab=lab).outcome.deviation.max <= 0.03  # m

@@ -1,7 +1,6 @@
 """Plans keep a margin for gaps in setpoints and poses; a file whose plan does not is refused."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,16 +12,13 @@ from cfplan.preparation.local_slowing import slow_locally
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import require_glitch_margin
 from cfplan.simulation.glitches import TURNED_OVER, glitch_at_every_setpoint
-
-LOOP = Path(__file__).parents[2] / "flights" / "loop3d.yaml"
+from tests.least_snap import along_least_snap
 
 
 @pytest.fixture(scope="module")
 def loop(limits, tmp_path_factory):
     """A plan along a path of least snap, on which gaps lead farther off than on the fastest one."""
-    file = tmp_path_factory.mktemp("loop") / LOOP.name
-    file.write_text(f"{LOOP.read_text()}shape: min-snap\ntimes: length\n")
-    return plan_flight(file, limits).plan
+    return plan_flight(along_least_snap("loop3d", tmp_path_factory.mktemp("loop")), limits).plan
 
 
 def cut_at(limits, deviation):

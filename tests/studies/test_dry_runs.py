@@ -9,6 +9,7 @@ from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.safety.limits_file import load_limits
 from studies.dry_runs import STUDY, Settings
 from studies.runner.cases import run_study
+from tests.least_snap import along_least_snap
 
 REPOSITORY = Path(__file__).parents[2]
 SAFETY = REPOSITORY / "safety.yaml"
@@ -16,8 +17,8 @@ MOST = {"line": (1.43, 1.61, 2.00), "random": (1.40, 1.75, 4.21)}  # cm, with al
 
 
 @pytest.fixture(scope="module")
-def result():
-    files = tuple(REPOSITORY / "flights" / f"{name}.yaml" for name in MOST)
+def result(tmp_path_factory):
+    files = tuple(along_least_snap(name, tmp_path_factory.mktemp(name)) for name in MOST)
     return run_study("dry-runs", "studies.dry_runs", STUDY, Settings(files))
 
 
@@ -29,8 +30,8 @@ def test_no_path_deviates_more_than_with_all_rates_sent_as_rates(result):
             assert 100 * deviation <= most
 
 
-def test_it_is_what_preparation_finds_for_a_vehicle_of_that_lag(result):
+def test_it_is_what_preparation_finds_for_a_vehicle_of_that_lag(result, tmp_path):
     limits = load_limits(SAFETY)
     assert replace(limits.airframe, motor_time_constant=0.105) == limits.airframe
-    found = prepare_flight(REPOSITORY / "flights" / "line.yaml", limits).dry_run.deviation
+    found = prepare_flight(along_least_snap("line", tmp_path), limits).dry_run.deviation
     assert result.table("dry-runs").rows[0]["deviation_105_ms"] == pytest.approx(found, abs=1e-9)
