@@ -298,7 +298,7 @@ class Planner:
         return self.told
 
     def answers(self, count: int) -> list[PathAnswer]:
-        """Wait for so many answers; return and forget them."""
+        """Wait for a number of answers; return and remove them."""
         assert until(lambda: len(self.hear()) >= count)
         found, self.told = self.told, []
         return found

@@ -31,8 +31,8 @@ class ChosenKnots(NamedTuple):
     """Where a search ended."""
 
     knots: Knots
-    missed: float  # m, by which the path leaves the room; negative inside
-    aside: float  # m, by which it leaves the corridor; likewise
+    missed: float  # m, how far the path leaves the room; negative inside
+    aside: float  # m, how far it leaves the corridor; likewise
     finished: bool  # before the deadline
 
 

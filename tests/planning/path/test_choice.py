@@ -57,7 +57,7 @@ def choose(points, limits, *, yaw=YawMode.FIXED, yaw_angle=0.0, regions=None, co
 
 
 def distances(path, points):
-    """How near the path comes to each point, and where, s."""
+    """Return the least distance between the path and each point, m, and the s of the nearest place."""
     s = np.linspace(0.0, path.end, 20_001)
     away = np.linalg.norm(path(s)[:, None] - np.asarray(points, dtype=float), axis=-1)
     return away.min(axis=0), s[away.argmin(axis=0)]
@@ -178,7 +178,7 @@ POLE = Cylinder(0.0, 0.0, 0.1, 0.0, 2.0, "pole")
 
 @pytest.mark.parametrize("obstacles", [(TABLE,), (POLE,), (TABLE, Cylinder(1.2, 1.0, 0.1, 0.0, 2.0))])
 def test_obstacles_are_passed_beside_where_link_loss_must_end_clear_of_them(obstacles, limits):
-    """Over the table the way is shorter, and that is where it leads if nobody minds what falls on it."""
+    """Over the table the path is shorter. It leads there only if safety.yaml merely warns of link loss."""
     furnished = replace(limits, space=replace(limits.space, obstacles=obstacles))
     points = [[-1.2, -2.0, 1.0], [0.9, 2.0, 1.2]]
     path = choose(points, furnished).path
