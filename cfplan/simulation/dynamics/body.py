@@ -1,4 +1,9 @@
-"""The simulated vehicle: a rigid body with motor lag and rotor drag, stepped at 1 kHz or a little slower.
+"""The simulated vehicle: a rigid body with motor lag and what air does to moving rotors, stepped at 1 kHz or slower.
+
+Air does three things in proportion to the velocity v through it, in body axes: drag, a moment about x and y that tilts
+the body against its motion (v_y about x, -v_x about y: blade flapping, drag above the centre of mass), and with |v|² in
+the rotor plane more thrust at the same rotor speed. Real flights show all three. Motors give the thrust that they are
+asked for times the airframe's thrust scale.
 
 Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
 Everything runs inside numba, so state and parameters are flat arrays:
@@ -36,7 +41,10 @@ MOTORS = slice(13, 17)
 STATE_SIZE = 17
 
 # Where each parameter lies in the array that `pack_body` makes.
-MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, FLOOR, _REACTION, STEP = range(13)
+(
+    MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, FLOOR, _REACTION, STEP,
+    _ROLL_MOMENT, _PITCH_MOMENT, _LIFT, THRUST_SCALE,
+) = range(17)  # fmt: skip
 
 Parameters = Any  # what `pack_body` makes, as an array or as a tuple
 Motors = tuple[float, float, float, float]
@@ -59,6 +67,9 @@ def pack_body(airframe: Airframe, *, floor: float = 0.0, step: float = TIME_STEP
             floor,
             airframe.rotor_reaction,
             step,
+            *airframe.velocity_moment,
+            airframe.lift_with_speed,
+            airframe.thrust_scale,
         ],
         dtype=float,
     )
@@ -83,26 +94,28 @@ def at_rest(position: NDArray, yaw: float = 0.0) -> NDArray:
 def step_body(state: NDArray, command: NDArray, body: NDArray, wind: NDArray, efficiency: NDArray) -> None:
     """Advance `state` by one step, in place.
 
-    `command` (4,) N is what each motor is asked for, clipped to what it can give; `wind` (3,) m/s in world axes;
-    `efficiency` (4,) is the share of its thrust that each motor gives, 1 without a fault.
+    `command` (4,) N is what each motor is asked for, clipped to `motor_thrust_max`, then scaled; `wind` (3,) m/s in
+    world axes; `efficiency` (4,) is the share of its thrust that each motor gives, 1 without a fault.
     """
     step = body[STEP]
     lag = lag_share(body)
-    push_0, twist_0 = _spin_up(state, command, body, efficiency, lag, 0)
-    push_1, twist_1 = _spin_up(state, command, body, efficiency, lag, 1)
-    push_2, twist_2 = _spin_up(state, command, body, efficiency, lag, 2)
-    push_3, twist_3 = _spin_up(state, command, body, efficiency, lag, 3)
+    axes = axes_of(state[6], state[7], state[8], state[9])
+    air = along_axes((state[3] - wind[0], state[4] - wind[1], state[5] - wind[2]), axes)
+    lift = lift_of(air, body)
+    push_0, twist_0 = _spin_up(state, command, body, efficiency, lag, lift, 0)
+    push_1, twist_1 = _spin_up(state, command, body, efficiency, lag, lift, 1)
+    push_2, twist_2 = _spin_up(state, command, body, efficiency, lag, lift, 2)
+    push_3, twist_3 = _spin_up(state, command, body, efficiency, lag, lift, 3)
 
     # On the floor the ground takes all torque and every force that does not lift the body off it.
-    axes = axes_of(state[6], state[7], state[8], state[9])
-    lift = (push_0 + push_1 + push_2 + push_3) * axes[2][2]
-    if state[2] <= body[FLOOR] and state[5] <= 0.0 and lift <= body[MASS] * GRAVITY:
+    upward = (push_0 + push_1 + push_2 + push_3) * axes[2][2]
+    if state[2] <= body[FLOOR] and state[5] <= 0.0 and upward <= body[MASS] * GRAVITY:
         rest(state, body)
         return
 
-    velocity, air = (state[3], state[4], state[5]), (state[3] - wind[0], state[4] - wind[1], state[5] - wind[2])
+    velocity, rate = (state[3], state[4], state[5]), (state[10], state[11], state[12])
     pushes, twists = (push_0, push_1, push_2, push_3), (twist_0, twist_1, twist_2, twist_3)
-    state[10], state[11], state[12] = turned_faster((state[10], state[11], state[12]), pushes, twists, body)
+    state[10], state[11], state[12] = turned_faster(rate, air, pushes, twists, body)
     state[3], state[4], state[5] = accelerated(velocity, air, axes, pushes, body)
     for axis in range(3):
         state[axis] += step * state[3 + axis]
@@ -120,8 +133,22 @@ def lag_share(body: Parameters) -> float:
 @register_jitable(forceinline=True)
 def spun_up(thrust: float, asked: float, body: Parameters, lag: float) -> tuple[float, float]:
     """Return a motor's thrust, N, after a step in which it is asked for another, and by how much it changes."""
-    change = (min(max(asked, 0.0), body[THRUST_MAX]) - thrust) * lag
+    change = (body[THRUST_SCALE] * min(max(asked, 0.0), body[THRUST_MAX]) - thrust) * lag
     return thrust + change, change
+
+
+@register_jitable(forceinline=True)
+def along_axes(vector: Vector, axes: tuple[Vector, Vector, Vector]) -> tuple[float, float, float]:
+    """Return a vector's components along three axes."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
+    x, y, z = vector
+    return xx * x + xy * y + xz * z, yx * x + yy * y + yz * z, zx * x + zy * y + zz * z
+
+
+@register_jitable(forceinline=True)
+def lift_of(air: Vector, body: Parameters) -> float:
+    """Return the factor on thrust of a velocity through the air, m/s in body axes."""
+    return 1.0 + body[_LIFT] * (air[0] * air[0] + air[1] * air[1])
 
 
 @register_jitable(forceinline=True)
@@ -134,11 +161,14 @@ def twist_of(push: float, change: float, body: Parameters) -> float:
 
 
 @register_jitable(forceinline=True)
-def turned_faster(rate: Vector, pushes: Motors, twists: Motors, body: Parameters) -> Vector:
-    """Return the body rate, rad/s, after a step, by the push of each motor, N, and its torque, N m."""
+def turned_faster(rate: Vector, air: Vector, pushes: Motors, twists: Motors, body: Parameters) -> Vector:
+    """Return the body rate, rad/s, after a step.
+
+    By the velocity through the air, m/s in body axes, the push of each motor, N, and its torque, N m.
+    """
     push_0, push_1, push_2, push_3 = pushes
-    torque_x = body[_ARM] * (-push_0 - push_1 + push_2 + push_3)
-    torque_y = body[_ARM] * (-push_0 + push_1 + push_2 - push_3)
+    torque_x = body[_ARM] * (-push_0 - push_1 + push_2 + push_3) + body[_ROLL_MOMENT] * air[1]
+    torque_y = body[_ARM] * (-push_0 + push_1 + push_2 - push_3) - body[_PITCH_MOMENT] * air[0]
     torque_z = -twists[0] + twists[1] - twists[2] + twists[3]
     (wx, wy, wz), step = rate, body[STEP]
     jx, jy, jz = body[_JX], body[_JY], body[_JZ]
@@ -153,13 +183,13 @@ def turned_faster(rate: Vector, pushes: Motors, twists: Motors, body: Parameters
 def accelerated(
     velocity: Vector, air: Vector, axes: tuple[Vector, Vector, Vector], pushes: Motors, body: Parameters
 ) -> Vector:
-    """Return the velocity, m/s, after a step, by that through the air, the axes and the push of each motor, N."""
+    """Return the velocity, m/s, after a step, by that through the air in body axes, the axes and the pushes, N."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
-    (ax, ay, az), step = air, body[STEP]
+    step = body[STEP]
     thrust = pushes[0] + pushes[1] + pushes[2] + pushes[3]
-    force_x = -body[DRAG] * (xx * ax + xy * ay + xz * az)
-    force_y = -body[DRAG] * (yx * ax + yy * ay + yz * az)
-    force_z = thrust - body[AXIAL_DRAG] * (zx * ax + zy * ay + zz * az)
+    force_x = -body[DRAG] * air[0]
+    force_y = -body[DRAG] * air[1]
+    force_z = thrust - body[AXIAL_DRAG] * air[2]
     return (
         velocity[0] + step * (xx * force_x + yx * force_y + zx * force_z) / body[MASS],
         velocity[1] + step * (xy * force_x + yy * force_y + zy * force_z) / body[MASS],
@@ -169,11 +199,11 @@ def accelerated(
 
 @register_jitable(forceinline=True)
 def _spin_up(
-    state: NDArray, command: NDArray, body: NDArray, efficiency: NDArray, lag: float, motor: int
+    state: NDArray, command: NDArray, body: NDArray, efficiency: NDArray, lag: float, lift: float, motor: int
 ) -> tuple[float, float]:
     """Advance a motor's thrust by a step; return its push, N, and its torque about the thrust axis, N m."""
     state[13 + motor], change = spun_up(state[13 + motor], command[motor], body, lag)
-    push = state[13 + motor] * efficiency[motor]
+    push = state[13 + motor] * efficiency[motor] * lift
     return push, twist_of(push, change, body)
 
 

@@ -19,7 +19,9 @@ from cfplan.simulation.dynamics.body import (
     THRUST_MAX,
     Parameters,
     accelerated,
+    along_axes,
     lag_share,
+    lift_of,
     rest,
     spun_up,
     turn_of,
@@ -243,16 +245,19 @@ def _accelerate(panel: NDArray, n: int, body: Parameters, lag: float) -> None:
     push_3, change_3 = spun_up(panel[16 * WIDTH + n], panel[(THRUSTS + 3) * WIDTH + n], body, lag)
     _write(panel, 13, n, (push_0, push_1, push_2))
     panel[16 * WIDTH + n] = push_3
+    qx, qy, qz = _vector(panel, 6, n)
+    axes = axes_of(qx, qy, qz, panel[9 * WIDTH + n])
+    rate, velocity = _vector(panel, 10, n), _vector(panel, 3, n)
+    air = along_axes(velocity, axes)
+    lift = lift_of(air, body)
+    push_0, push_1, push_2, push_3 = push_0 * lift, push_1 * lift, push_2 * lift, push_3 * lift
     pushes = push_0, push_1, push_2, push_3
     twists = (
         twist_of(push_0, change_0, body), twist_of(push_1, change_1, body), twist_of(push_2, change_2, body),
         twist_of(push_3, change_3, body),
     )  # fmt: skip
-    qx, qy, qz = _vector(panel, 6, n)
-    axes = axes_of(qx, qy, qz, panel[9 * WIDTH + n])
-    rate, velocity = _vector(panel, 10, n), _vector(panel, 3, n)
-    rate = turned_faster(rate, pushes, twists, body)
-    velocity = accelerated(velocity, velocity, axes, pushes, body)
+    rate = turned_faster(rate, air, pushes, twists, body)
+    velocity = accelerated(velocity, air, axes, pushes, body)
     _write(panel, 10, n, rate)
     _write(panel, 3, n, velocity)
     x, y, z = _vector(panel, 0, n)
@@ -279,10 +284,10 @@ def whole(count: int) -> int:
 
 @register_jitable
 def unpacked_body(body: NDArray) -> Parameters:
-    """Return the parameters of a body, (13,), as a tuple, which the compiler knows not to change."""
+    """Return the parameters of a body, (17,), as a tuple, which the compiler knows not to change."""
     return (
         body[0], body[1], body[2], body[3], body[4], body[5], body[6], body[7], body[8], body[9], body[10], body[11],
-        body[12],
+        body[12], body[13], body[14], body[15], body[16],
     )  # fmt: skip
 
 

@@ -55,6 +55,35 @@ def test_hover_thrust_holds_it_where_it_is():
     assert state == pytest.approx(start, abs=1e-12)
 
 
+def test_a_thrust_scale_is_made_up_for_by_the_command():
+    frame = airframe(thrust_scale=1.25)
+    start = hovering(frame, [0.0, 0.0, 2.0])
+    state = fly(start, np.full(4, frame.hover_thrust / 1.25), pack_body(frame), 5.0)
+    assert state == pytest.approx(start, abs=1e-12)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.1])
+def test_air_tilts_a_vehicle_against_its_motion(yaw):
+    frame = airframe(velocity_moment=(4.7e-4, 6.5e-4))
+    start, heading = hovering(frame, [0.0, 0.0, 2.0], yaw=yaw), matrix_of(hovering(frame, np.zeros(3), yaw)[QUATERNION])
+    start[VELOCITY] = heading @ [2.0, 0.5, 0.3]
+    state = fly(start, np.full(4, frame.hover_thrust), pack_body(frame), TIME_STEP)
+    torque = np.array(frame.inertia) * state[BODY_RATE] / TIME_STEP
+    assert torque == pytest.approx([4.7e-4 * 0.5, -6.5e-4 * 2.0, 0.0], abs=1e-15)  # left side up, nose up
+    still = fly(start, np.full(4, frame.hover_thrust), pack_body(frame), TIME_STEP, wind=heading @ [2.0, 0.5, 0.3])
+    assert still[BODY_RATE] == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_speed_in_the_rotor_plane_lifts():
+    frame = airframe(lift_with_speed=0.008)
+    start = hovering(frame, [0.0, 0.0, 2.0])
+    for velocity, gained in (([1.5, 2.0, 0.0], 0.008 * 6.25), ([0.0, 0.0, 2.0], 0.0)):
+        start[VELOCITY] = velocity
+        state = fly(start, np.full(4, frame.hover_thrust), pack_body(frame), TIME_STEP)
+        risen = (state[VELOCITY] - start[VELOCITY])[2] / TIME_STEP
+        assert risen == pytest.approx(gained * GRAVITY, abs=1e-9)
+
+
 @pytest.mark.parametrize(("upright", "coefficient"), [(True, 0.02), (False, 0.05)])
 def test_a_fall_ends_at_the_speed_at_which_drag_carries_the_weight(upright, coefficient):
     frame = airframe(drag=(0.05, 0.02))
