@@ -3,7 +3,7 @@
 Air does three things in proportion to the velocity v through it, in body axes: drag, a moment about x and y that tilts
 the body against its motion (v_y about x, -v_x about y: blade flapping, drag above the centre of mass), and with |v|² in
 the rotor plane more thrust at the same rotor speed. Real flights show all three. Motors give the thrust that they are
-asked for times the airframe's thrust scale.
+asked for times the airframe's thrust scale; where that curves, a parabola through nothing asked and hover.
 
 Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
 Everything runs inside numba, so state and parameters are flat arrays:
@@ -43,8 +43,8 @@ STATE_SIZE = 17
 # Where each parameter lies in the array that `pack_body` makes.
 (
     MASS, _JX, _JY, _JZ, _ARM, _THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, FLOOR, _REACTION, STEP,
-    _ROLL_MOMENT, _PITCH_MOMENT, _LIFT, THRUST_SCALE,
-) = range(17)  # fmt: skip
+    _ROLL_MOMENT, _PITCH_MOMENT, _LIFT, THRUST_SCALE, _CURVATURE, _HOVER,
+) = range(19)  # fmt: skip
 
 Parameters = Any  # what `pack_body` makes, as an array or as a tuple
 Motors = tuple[float, float, float, float]
@@ -70,6 +70,8 @@ def pack_body(airframe: Airframe, *, floor: float = 0.0, step: float = TIME_STEP
             *airframe.velocity_moment,
             airframe.lift_with_speed,
             airframe.thrust_scale,
+            airframe.thrust_curvature,
+            airframe.hover_thrust / airframe.thrust_scale,
         ],
         dtype=float,
     )
@@ -133,7 +135,12 @@ def lag_share(body: Parameters) -> float:
 @register_jitable(forceinline=True)
 def spun_up(thrust: float, asked: float, body: Parameters, lag: float) -> tuple[float, float]:
     """Return a motor's thrust, N, after a step in which it is asked for another, and by how much it changes."""
-    change = (body[THRUST_SCALE] * min(max(asked, 0.0), body[THRUST_MAX]) - thrust) * lag
+    asked = min(max(asked, 0.0), body[THRUST_MAX])
+    curvature = body[_CURVATURE]
+    if curvature > 0.0:
+        share = min(asked / body[_HOVER], (1.0 + curvature) / (2.0 * curvature))  # no further than the top
+        asked = body[_HOVER] * share * (1.0 + curvature - curvature * share)
+    change = (body[THRUST_SCALE] * asked - thrust) * lag
     return thrust + change, change
 
 

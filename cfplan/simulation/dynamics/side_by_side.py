@@ -284,10 +284,11 @@ def whole(count: int) -> int:
 
 @register_jitable
 def unpacked_body(body: NDArray) -> Parameters:
-    """Return the parameters of a body, (17,), as a tuple, which the compiler knows not to change."""
+    """Return the parameters of a body, (19,), as a tuple, which the compiler knows not to change."""
     return (
         body[0], body[1], body[2], body[3], body[4], body[5], body[6], body[7], body[8], body[9], body[10], body[11],
         body[12], body[13], body[14], body[15], body[16],
+        body[17], body[18],
     )  # fmt: skip
 
 

@@ -61,19 +61,19 @@ class Loop(NamedTuple):
     efficiency: NDArray  # (4,) share of its thrust that each motor gives
     override: NDArray  # (5,) motorPowerSet: whether its commands count, 2 and 3 the first for all; 16-bit commands
     idle: NDArray  # (1,) 16-bit command that no motor falls below while it may turn
-    body: NDArray  # (17,) the body's parameters, see `body`
+    body: NDArray  # (19,) the body's parameters, see `body`
     prior: NDArray  # (16,) the filter's parameters, see `kalman`
     gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
     pid_gains: NDArray  # (12, 5) see `pid`
     pid_limits: NDArray  # (5,)
 
 
-_FLOATS = 322  # of all parts together
+_FLOATS = 324  # of all parts together
 
 
 @register_jitable
 def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
-    """Return the parts of the array (322,) in their order."""
+    """Return the parts of the array (324,) in their order."""
     return Loop(
         truth=floats[0:17],
         kalman=Filter(floats[17:26], floats[26:30], floats[30:111].reshape(9, 9), floats[111:118], floats[118:122]),
@@ -89,11 +89,11 @@ def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
         efficiency=floats[195:199],
         override=floats[199:204],
         idle=floats[204:205],
-        body=floats[205:222],
-        prior=floats[222:238],
-        gains=floats[238:257],
-        pid_gains=floats[257:317].reshape(12, 5),
-        pid_limits=floats[317:322],
+        body=floats[205:224],
+        prior=floats[224:240],
+        gains=floats[240:259],
+        pid_gains=floats[259:319].reshape(12, 5),
+        pid_limits=floats[319:324],
     )
 
 
