@@ -137,8 +137,10 @@ def spun_up(thrust: float, asked: float, body: Parameters, lag: float) -> tuple[
     """Return a motor's thrust, N, after a step in which it is asked for another, and by how much it changes."""
     asked = min(max(asked, 0.0), body[THRUST_MAX])
     curvature = body[_CURVATURE]
-    if curvature > 0.0:
-        share = min(asked / body[_HOVER], (1.0 + curvature) / (2.0 * curvature))  # no further than the top
+    if curvature != 0.0:
+        share = asked / body[_HOVER]
+        if curvature > 0.0:
+            share = min(share, (1.0 + curvature) / (2.0 * curvature))  # no further than the top
         asked = body[_HOVER] * share * (1.0 + curvature - curvature * share)
     change = (body[THRUST_SCALE] * asked - thrust) * lag
     return thrust + change, change
