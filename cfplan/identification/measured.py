@@ -41,6 +41,7 @@ class Measured:
     airframe: Airframe
     found: dict[str, str]  # quantity: value with its unit, and how well it is known
     unknown: tuple[str, ...]  # quantities that the log does not show, each with the reason
+    unlike: tuple[str, ...]  # how it differs from the airframe that was named, by more than its spread
     estimate: dict[str, float]  # errors of the estimate against motion capture: rms of m, m/s and rad; empty if unknown
 
 
@@ -102,7 +103,23 @@ def measure(log: FlightLog, airframe: Airframe) -> Measured:
         known = by(columns, known, found, unknown)
     known = replace(known, thrust_scale=thrust_scale(log, known))
     found["thrust scale"] = f"{known.thrust_scale:.3f} of what is asked for, in the first {HOVER:g} s"
-    return Measured(known, found, tuple(unknown), _errors_of_estimate(log))
+    return Measured(known, found, tuple(unknown), tuple(unlike(known, airframe)), _errors_of_estimate(log))
+
+
+def unlike(found: Airframe, kind: Airframe) -> list[str]:
+    """Return in words what is farther from an airframe than its spread allows: it may be another vehicle's flight."""
+    pairs = [
+        ("thrust scale", found.thrust_scale, kind.thrust_scale, kind.spread.thrust_scale),
+        ("drag over mass", found.drag[0] / found.mass, kind.drag[0] / kind.mass, kind.spread.drag),
+        ("roll moment", found.velocity_moment[0], kind.velocity_moment[0], kind.spread.velocity_moment),
+        ("pitch moment", found.velocity_moment[1], kind.velocity_moment[1], kind.spread.velocity_moment),
+        ("motor lag", found.motor_time_constant, kind.motor_time_constant, kind.spread.motor_time_constant),
+    ]
+    return [
+        f"{name} {value:.3g}, outside {usual:.3g} ± {spread:.0%} of {kind.name}"
+        for name, value, usual, spread in pairs
+        if abs(value - usual) > spread * usual
+    ]
 
 
 def pooled(flights: Sequence[Measured], airframe: Airframe) -> Airframe:
