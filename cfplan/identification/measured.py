@@ -55,6 +55,7 @@ class _Smooth:
     torque: NDArray  # (K, 3) N m, as asked for, not smoothed
     thrust: NDArray  # (K,) N, as asked for, not smoothed
     force: NDArray | None  # (K, 3) m/s²
+    seen: bool  # whether the velocity is motion capture's: the estimated one is too high
     along: NDArray  # (K,) m/s², specific force along the thrust axis: of the accelerometer, or of the climb
 
 
@@ -168,7 +169,7 @@ def _smoothed(log: FlightLog) -> _Smooth:
     climb = gaussian_filter1d(on_grid(log.state[:, 5])[:, 0], _CLIMB_SMOOTHING / _PERIOD)
     return _Smooth(
         keep, velocity, smooth(log.state[:, 10:13]), on_grid(log.control[:, 1:]),
-        on_grid(log.control[:, 0])[:, 0], force,
+        on_grid(log.control[:, 0])[:, 0], force, _has_poses(log),
         (np.gradient(climb, _PERIOD) + GRAVITY) / up if force is None else force[:, 2],
     )  # fmt: skip
 
@@ -210,7 +211,8 @@ def _by_torque(columns: _Smooth, known: Airframe, found: dict[str, str], unknown
         slope, held, fit, deviation = fits[lag][axis]
         if axis in axes and fit > _LEAST_FIT and _within(slope, _INERTIAS) and _within(held, _MOMENTS):
             moment[axis], inertia[axis] = held, slope
-            found[f"{name} moment"] = f"{1e4 * held:.2f} ± {1e4 * deviation:.2f} e-4 N m per m/s ({fit:.0%} explained)"
+            text = f"{1e4 * held:.2f} ± {1e4 * deviation:.2f} e-4 N m per m/s ({fit:.0%} explained)"
+            found[f"{name} moment"] = text if columns.seen else f"{text}, low by a tenth or two: without motion capture"
             found[f"{name} inertia"] = f"{1e5 * slope:.2f} e-5 kg m²"
         else:
             unknown.append(f"{name} moment: {'flown too slowly' if axis not in axes else 'the torque is another'}")

@@ -24,9 +24,9 @@ DURATION, RATE = 9.0, 250
 
 def figure8(duration: float = DURATION, period: float = 4.5) -> Reference:
     """A figure eight of 2 m by 1 m, begun slowly from rest a second after the log begins."""
-    time = np.arange(0.0, duration + 0.005, 0.005)
+    time = np.arange(0.0, duration + 0.015, 0.005)
     since = np.maximum(time - 1.0, 0.0)
-    phase = 2 * np.pi / period * since**2 / (since + 1.0)
+    phase = 2 * np.pi / period * since**5 / (since**4 + 2.0)
     rows = np.zeros((len(time), REFERENCE_SIZE))
     rows[:, 0], rows[:, 1], rows[:, 2] = 0.5 * np.sin(2 * phase), 1.0 - np.cos(phase), 1.0
     for order in (1, 2, 3):
@@ -38,7 +38,7 @@ def figure8(duration: float = DURATION, period: float = 4.5) -> Reference:
 def logged(airframe=REAL, controller=CONTROLLER, reference=None, seed=0, sensors=True) -> FlightLog:
     """The log of a flight, with the noise of logs and poses at 100 Hz of a marker body."""
     reference = reference or figure8()
-    duration = float(reference.time[-1])
+    duration = DURATION
     times = np.arange(0.0, duration, 0.010)
     start = np.zeros(13)
     start[:3], start[9] = reference.rows[0, :3], 1.0
