@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from cfplan.errors import InputError
 from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog
-from cfplan.identification.reference import POSITION, YAW, Reference
+from cfplan.identification.reference import POSITION, YAW, ReferenceMotion
 from cfplan.machine_code import njit
 from cfplan.simulation.dynamics import lee, mellinger
 from cfplan.simulation.dynamics.lee import LeeGains, step_lee
@@ -56,7 +56,7 @@ class Controller:
         """Return whether it is Lee's."""
         return isinstance(self.gains, LeeGains)
 
-    def setpoints(self, reference: Reference, time: NDArray) -> NDArray:
+    def setpoints(self, reference: ReferenceMotion, time: NDArray) -> NDArray:
         """Return what it is given at these times, (N, 14) of Lee's or (N, 20) of Mellinger's."""
         if not self.by_lee and len(reference.sent):
             return reference.sent_at(time)
@@ -86,7 +86,7 @@ class Recomputed:
         return float(np.nanmin([self.thrust, self.torque]))
 
 
-def recompute(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
+def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Recomputed:
     """Return the commands that a controller gives for the logged state. Raises InputError where none were logged."""
     gains, setpoints = controller.gains.pack(), controller.setpoints(reference, log.time)
     size = lee.MEMORY_SIZE if controller.by_lee else mellinger.MEMORY_SIZE
@@ -122,8 +122,12 @@ def recompute(log: FlightLog, reference: Reference, controller: Controller, airf
 
 
 def find_start(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, offset: NDArray | None = None
-) -> Reference:
+    log: FlightLog,
+    reference: ReferenceMotion,
+    controller: Controller,
+    airframe: Airframe,
+    offset: NDArray | None = None,
+) -> ReferenceMotion:
     """Return the reference begun when it was flown: where it explains the commands best.
 
     A logged setpoint shows start and place directly. Else `offset`, (3,) m, is the place of its origin; without it x
@@ -145,8 +149,8 @@ def find_start(
 
 
 def refine_start(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, search: float = _COARSE
-) -> Reference:
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe, search: float = _COARSE
+) -> ReferenceMotion:
     """Return the reference begun up to `search` s sooner or later, where it explains the torque best."""
 
     def unexplained(later: float) -> float:
@@ -159,7 +163,7 @@ def refine_start(
     return reference.moved(float(fine.x), np.zeros(3))
 
 
-def choose_jerk(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Controller:
+def choose_jerk(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Controller:
     """Return the controller, or where only that explains the torque, the one whose firmware feeds jerk otherwise."""
     if not controller.by_lee or recompute(log, reference, controller, airframe).torque >= LEAST_EXPLAINED:
         return controller
@@ -167,7 +171,9 @@ def choose_jerk(log: FlightLog, reference: Reference, controller: Controller, ai
     return other if recompute(log, reference, other, airframe).torque >= LEAST_EXPLAINED else controller
 
 
-def check_explained(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
+def check_explained(
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
+) -> Recomputed:
     """Return the recomputed commands. Raises InputError where they explain too little, naming the likely gain."""
     found = recompute(log, reference, controller, airframe)
     if found.explained >= LEAST_EXPLAINED:
@@ -186,7 +192,9 @@ def check_explained(log: FlightLog, reference: Reference, controller: Controller
     )
 
 
-def likely_cause(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> tuple[str, float]:
+def likely_cause(
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
+) -> tuple[str, float]:
     """Return the start or the one gain that explains most if changed, as text, and the fraction explained then."""
     moved = refine_start(log, reference, controller, airframe, _SEARCHED)
     best = recompute(log, moved, controller, airframe).explained
@@ -234,10 +242,10 @@ def _integral_gains(gains: LeeGains | MellingerGains) -> tuple[float, ...]:
     return gains.ki_xy, gains.ki_xy, gains.ki_z, gains.ki_m_xy, gains.ki_m_xy, gains.ki_m_z
 
 
-def _found_by_setpoints(log: FlightLog, reference: Reference, setpoint: NDArray) -> Reference:
+def _found_by_setpoints(log: FlightLog, reference: ReferenceMotion, setpoint: NDArray) -> ReferenceMotion:
     """Return the reference moved in time and place onto the logged setpoints."""
 
-    def moved(start: float) -> tuple[Reference, float]:
+    def moved(start: float) -> tuple[ReferenceMotion, float]:
         begun = reference.moved(start, np.zeros(3))
         rows = begun.at(log.time)
         offset = np.median(setpoint[:, :3] - rows[:, POSITION], axis=0)
@@ -250,7 +258,7 @@ def _found_by_setpoints(log: FlightLog, reference: Reference, setpoint: NDArray)
     return moved(float(min(fine, key=lambda start: moved(float(start))[1])))[0]
 
 
-def _apart(log: FlightLog, reference: Reference) -> float:
+def _apart(log: FlightLog, reference: ReferenceMotion) -> float:
     """Return the mean squared distance in x and y of the estimate from a reference, at every tenth record, m²."""
     off = reference.at(log.time[::10])[:, :2] - log.state[::10, :2]
     return float(np.mean((off - off.mean(axis=0)) ** 2))

@@ -2,6 +2,7 @@
 
 __all__ = [
     "dry_run",
+    "dynamics",
     "geometric_flight",
     "glitches",
     "lab",
