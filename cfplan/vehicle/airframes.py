@@ -14,9 +14,11 @@ firmware's default gains wherever the time constant exceeds 0.1 s.
 """
 
 import difflib
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -83,7 +85,7 @@ AIRFRAMES = MappingProxyType(
 )
 
 
-AS_FLOWN = MappingProxyType(
+AS_FLOWN: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "crazyflie-2.1+": {
             "velocity_moment": (4.5e-4, 6.2e-4), "thrust_scale": 1.06, "thrust_curvature": 0.1,
