@@ -13,7 +13,7 @@ from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits
 from cfplan.simulation.dry_run import SETTLING, dry_run
-from cfplan.simulation.dynamics.closed_loop import EstimateErrors
+from cfplan.simulation.engine.flight import EstimateErrors
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
