@@ -15,7 +15,7 @@ from cfplan.simulation.engine.layout import (
 
 
 def stepped(state, asked, airframe, seconds, *, wind=STILL_AIR, efficiency=FULL_EFFICIENCY) -> np.ndarray:
-    """Return the state, (17,), `seconds` later, of a packed airframe, (23,)."""
+    """Return the state, (17,), `seconds` later, of a packed airframe, (26,)."""
     vehicle = new_vehicle(state, airframe)
     vehicle[ASKED : ASKED + 4], vehicle[WIND : WIND + 3], vehicle[EFFICIENCY : EFFICIENCY + 4] = asked, wind, efficiency
     for _ in range(round(seconds / TIME_STEP)):

@@ -239,7 +239,7 @@ class _Forks(NamedTuple):
     setpoints: NDArray  # (N, 20)
     rows: NDArray  # (F,) int, the last setpoints
     snapshots: NDArray  # (L, F, 31) when they arrive
-    airframes: NDArray  # (L, 23)
+    airframes: NDArray  # (L, 26)
 
 
 def _swept(forks: _Forks, limits: Limits, step: int = _STEP) -> NDArray:
@@ -313,7 +313,7 @@ def _united(boxes: list[NDArray]) -> NDArray:
 
 
 def _airframes(limits: Limits) -> NDArray:
-    """Return (L, 23): the airframe with each motor lag."""
+    """Return (L, 26): the airframe with each motor lag."""
     return _packed(limits.airframe, tuple(_lags(limits)))
 
 

@@ -47,7 +47,9 @@ class Airframe:
     velocity_moment: tuple[float, float] = (0.0, 0.0)
     """N m per m/s, moment about x by velocity along y, and about -y by velocity along x, in body axes."""
     thrust_scale: float = 1.0
-    """Thrust that the motors give per thrust that the controller asks for."""
+    """Thrust that the motors give in hover per thrust that the controller asks for."""
+    thrust_curvature: float = 0.0
+    """Fraction by which, about hover, thrust grows more slowly than in proportion to what is asked for."""
     lift_with_speed: float = 0.0
     """1/(m/s)², gain of thrust at equal rotor speed per squared speed in the rotor plane."""
     voltage_sag: float = 0.0

@@ -43,6 +43,7 @@ class _AirframeFile(BaseModel):
     rotor_reaction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     velocity_moment: tuple[Moment, Moment] = (0.0, 0.0)
     thrust_scale: Annotated[float, Field(ge=0.2, le=5.0)] = 1.0
+    thrust_curvature: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.0
     lift_with_speed: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
     voltage_sag: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
     spread: _SpreadFile = _SpreadFile()

@@ -3,7 +3,7 @@
 Air does three things in proportion to the velocity v through it, in body axes: drag, a moment about x and y that tilts
 the body against its motion (v_y about x, -v_x about y: blade flapping, drag above the centre of mass), and with |v|² in
 the rotor plane more thrust at the same rotor speed. Real flights show all three. Motors give the thrust that they are
-asked for times the airframe's thrust scale.
+asked for times the airframe's thrust scale; where that curves, a parabola through nothing asked and hover.
 
 Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
 
@@ -21,6 +21,8 @@ from cfplan.simulation.engine.layout import (
     ARM,
     ASKED,
     AXIAL_DRAG,
+    CURVATURE,
+    CURVATURE_PER_HOVER,
     DRAG,
     EFFICIENCY,
     FLOOR,
@@ -36,6 +38,7 @@ from cfplan.simulation.engine.layout import (
     THRUST_MAX,
     THRUST_SCALE,
     THRUST_TO_TORQUE,
+    TOP,
     WIND,
     quadruple,
     vector,
@@ -55,7 +58,7 @@ _LEVEL = 1e-9  # rad
 
 @njit(allocates=False, error_model="numpy")
 def step_body(vehicle: NDArray, step: float) -> None:
-    """Advance one vehicle, (74,) as in `layout`, by a step, s, with the thrusts that are asked for."""
+    """Advance one vehicle, (77,) as in `layout`, by a step, s, with the thrusts that are asked for."""
     move(vehicle, 1, 0, step)
     stay_above_floor(vehicle, 1, 0, step)
 
@@ -124,8 +127,10 @@ def _spin_up(
 ) -> tuple[float, float]:  # seven, as it is inlined
     """Advance a motor's thrust by a step; return its push, N, and its torque about the thrust axis, N m."""
     thrust, asked = batch[(13 + motor) * width + n], batch[(ASKED + motor) * width + n]
-    most, scale = batch[THRUST_MAX * width + n], batch[THRUST_SCALE * width + n]
-    change = (scale * min(max(asked, 0.0), most) - thrust) * response
+    most, scale = min(batch[THRUST_MAX * width + n], batch[TOP * width + n]), batch[THRUST_SCALE * width + n]
+    asked = min(max(asked, 0.0), most)
+    asked *= 1.0 + batch[CURVATURE * width + n] - batch[CURVATURE_PER_HOVER * width + n] * asked
+    change = (scale * asked - thrust) * response
     batch[(13 + motor) * width + n] = thrust + change
     push = (thrust + change) * batch[(EFFICIENCY + motor) * width + n] * lift
     return push, batch[THRUST_TO_TORQUE * width + n] * push + batch[REACTION * width + n] * change * per_step

@@ -37,9 +37,9 @@ MISSED = SETPOINT + SETPOINT_SIZE  # m and m/s: true less estimated position and
 AIRFRAME = MISSED + 6
 (
     MASS, JX, JY, JZ, ARM, THRUST_TO_TORQUE, THRUST_MAX, LAG, DRAG, AXIAL_DRAG, REACTION, ROLL_MOMENT, PITCH_MOMENT,
-    LIFT, THRUST_SCALE, FLOOR, WIND, _, _, EFFICIENCY, _, _, _,
-) = range(AIRFRAME, AIRFRAME + 23)  # fmt: skip
-AIRFRAME_SIZE = 23
+    LIFT, THRUST_SCALE, CURVATURE, CURVATURE_PER_HOVER, TOP, FLOOR, WIND, _, _, EFFICIENCY, _, _, _,
+) = range(AIRFRAME, AIRFRAME + 26)  # fmt: skip
+AIRFRAME_SIZE = 26
 VEHICLE_SIZE = AIRFRAME + AIRFRAME_SIZE
 
 STILL_AIR = np.zeros(3)
@@ -49,23 +49,26 @@ FULL_EFFICIENCY = np.ones(4)
 def pack_airframe(
     airframe: Airframe, *, floor: float = 0.0, wind: NDArray = STILL_AIR, efficiency: NDArray = FULL_EFFICIENCY
 ) -> NDArray:
-    """Return (23,): an airframe as a batch holds it, and what is about it.
+    """Return (26,): an airframe as a batch holds it, and what is about it.
 
     `floor` is the height of the ground, m, -inf for none; `wind` (3,) m/s in world axes; `efficiency` (4,) the fraction
     of its thrust that each motor gives.
     """
+    hover, curvature = airframe.hover_thrust / airframe.thrust_scale, airframe.thrust_curvature
+    top = hover * (1.0 + curvature) / (2.0 * curvature) if curvature > 0.0 else np.inf  # beyond, thrust would fall
     return np.array(
         [
             airframe.mass, *airframe.inertia, airframe.arm, airframe.thrust_to_torque, airframe.motor_thrust_max,
             airframe.motor_time_constant, *airframe.drag, airframe.rotor_reaction, *airframe.velocity_moment,
-            airframe.lift_with_speed, airframe.thrust_scale, floor, *wind, *efficiency,
+            airframe.lift_with_speed, airframe.thrust_scale, curvature, curvature / hover, top, floor, *wind,
+            *efficiency,
         ],
         dtype=float,
     )  # fmt: skip
 
 
 def new_vehicle(state: NDArray, airframe: NDArray) -> NDArray:
-    """Return one vehicle, (74,), in a state, (17,), by a packed airframe, (23,); its controller has not run yet."""
+    """Return one vehicle, (77,), in a state, (17,), by a packed airframe, (26,); its controller has not run yet."""
     vehicle = np.zeros(VEHICLE_SIZE)
     vehicle[:STATE_SIZE], vehicle[AIRFRAME:] = state, airframe
     return vehicle

@@ -75,7 +75,7 @@ def level_out(setpoint: NDArray, mode: NDArray) -> None:
 
 @njit(allocates=False, error_model="numpy")
 def step_mellinger(vehicle: NDArray, gains: Gains, mode: Modes, belief: NDArray, period: float) -> Quadruple:
-    """Step the controller of one vehicle, (74,), on what it believes, (13,); return its control."""
+    """Step the controller of one vehicle, (77,), on what it believes, (13,); return its control."""
     place, speed = (belief[0], belief[1], belief[2]), (belief[3], belief[4], belief[5])
     attitude, rate = (belief[6], belief[7], belief[8], belief[9]), (belief[10], belief[11], belief[12])
     return mellinger(vehicle, 1, 0, gains, mode, (place, speed, attitude, rate), period)

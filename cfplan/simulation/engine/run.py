@@ -53,7 +53,7 @@ class Vehicles(NamedTuple):
     """Vehicles, and what becomes of their links."""
 
     snapshots: NDArray  # (L, 31) at the beginning, as in `layout`
-    airframes: NDArray  # (L, 23) as `pack_airframe` makes them
+    airframes: NDArray  # (L, 26) as `pack_airframe` makes them
     first: NDArray  # (L,) int, row of the setpoint that arrives at the beginning
     last: NDArray  # (L,) int, row of the last one, which then stays due
     deaf_until: NDArray  # (L,) int, ms until which no other setpoint arrives

@@ -57,7 +57,7 @@ class Loop(NamedTuple):
     To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
     """
 
-    vehicle: NDArray  # (74,) as in `engine.layout`: body, Mellinger controller, setpoint, airframe
+    vehicle: NDArray  # (77,) as in `engine.layout`: body, Mellinger controller, setpoint, airframe
     truth: NDArray  # (17,) of that the body's state
     wind: NDArray  # (3,) m/s, of that
     efficiency: NDArray  # (4,) fraction of its thrust that each motor gives, of that

@@ -5,6 +5,7 @@ import sqlite3
 import struct
 import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from cfplan.errors import InputError
 from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.recording.importers.formats import read_log
 from tests.recording.importers import test_import_vicon as vicon
+
+FLIGHTS = Path(__file__).parents[4] / "shared" / "data" / "flights"
 
 COUNT = 30
 TIMES = np.arange(COUNT) * 0.01
@@ -355,6 +358,32 @@ def test_the_compressed_estimate_and_setpoint_are_millimetres_and_a_packed_quate
     np.testing.assert_allclose([estimate.position, setpoint.position], [millimetres / 1000] * 2, atol=1e-9)
     assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 0.005
     assert np.isnan(setpoint.quaternion).all()
+
+
+def test_the_lee_controllers_angles_are_the_attitudes_of_the_compressed_estimate_and_setpoint(tmp_path):
+    _, position, rotations = estimate_rows()
+    millimetres = np.round(position * 1000).astype(int)
+    groups = ("stateEstimateZ", "ctrltargetZ")
+    names = [f"{group}.{axis}(h)" for group in groups for axis in "xyz"]
+    names += [f"ctrlLee.{group}{axis}(f)" for group in ("rpy", "rpyd") for axis in "xyz"]
+    angles = rotations.as_euler("ZYX")[:, ::-1]
+    rows = [(*place, *place, *each, *(-each)) for place, each in zip(millimetres, angles, strict=True)]
+    estimate, setpoint = read_log(written(tmp_path, usd(names, rows))).subjects
+    assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 1e-6
+    wanted = Rotation.from_euler("ZYX", -angles[:, ::-1])
+    assert (Rotation.from_quat(setpoint.quaternion) * wanted.inv()).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["log76", "log206"])
+def test_public_logs_of_the_lee_controller_have_setpoint_and_attitude(name):
+    if not (file := FLIGHTS / "original_logs" / name).is_file():
+        pytest.skip("the public flights, ../shared/data/flights, are not here")
+    subjects = {subject.name: subject for subject in read_log(file).subjects}
+    estimate, setpoint = subjects["estimate, compressed"], subjects["setpoint, compressed"]
+    for subject in (estimate, setpoint):
+        assert np.isfinite(subject.quaternion).all()
+        assert Rotation.from_quat(subject.quaternion).as_matrix()[:, 2, 2].min() > 0.7  # upright
+    assert np.linalg.norm(estimate.position - setpoint.position, axis=1).max() < 0.3
 
 
 def test_roll_pitch_and_yaw_are_those_of_the_firmware_whose_pitch_is_nose_up(tmp_path):

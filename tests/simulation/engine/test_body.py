@@ -52,6 +52,19 @@ def test_a_thrust_scale_is_made_up_for_by_the_command():
     assert state == pytest.approx(start, abs=1e-12)
 
 
+def test_a_thrust_that_curves_gives_hover_and_rises_more_slowly():
+    frame = airframe(thrust_scale=1.5, thrust_curvature=1 / 3, motor_time_constant=0.0)
+    hover = frame.hover_thrust / 1.5
+
+    def given(asked):
+        return fly(hovering(frame, [0.0, 0.0, 2.0]), np.full(4, asked), pack_airframe(frame), TIME_STEP)[13]
+
+    assert given(hover) == pytest.approx(frame.hover_thrust)
+    assert (given(1.01 * hover) - given(0.99 * hover)) / (0.02 * hover) == pytest.approx(1.0)  # 1.5 (1 - 1/3)
+    assert given(0.0) == 0.0
+    assert given(2.2 * hover) == pytest.approx(4 / 3 * frame.hover_thrust)  # its top
+
+
 @pytest.mark.parametrize("yaw", [0.0, 1.1])
 def test_air_tilts_a_vehicle_against_its_motion(yaw):
     frame = airframe(velocity_moment=(4.7e-4, 6.5e-4))
