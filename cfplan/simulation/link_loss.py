@@ -133,9 +133,7 @@ def link_loss_at_walls(
     rows, airframes = setpoint_rows(state), _airframes(limits)
     snapshots = _flown(rows, limits, airframes, rate, _begins(state, limits, starts))
     seen = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
-    beyond, _ = limits.space.swept(seen)
-    near = ~(beyond + ALLOWANCE < 0.0)
-    seen[near] = _swept(_Forks(rows, np.flatnonzero(near), snapshots[:, near], airframes), limits)
+    near = _look_again(seen, rows, snapshots, limits, ALLOWANCE)
     found = _judge(np.arange(len(rows)) / rate, state.position, seen, limits, snapshots)
     return replace(found, beyond=np.where(near, found.beyond, found.beyond + ALLOWANCE))
 
@@ -150,12 +148,15 @@ def foreseen_link_loss(
 def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
     """Lose the link at setpoints of take-off, of the way to the start or of landing, (N, 29) uint8 at `rate`, Hz.
 
-    A first look at every eighth one tells unless one ends near a wall.
+    A first look at every eighth one tells unless it ends near a wall.
     """
-    seen = _foreseen(payloads, limits, rate, None, _SLOW_EVERY)
-    if seen.worst.beyond < -_SLOW_ALLOWANCE:
-        return seen
-    return link_loss_at_every_setpoint(payloads, limits, rate)
+    found, state = _foreseen(payloads, limits, rate, None, _SLOW_EVERY), decode(payloads)
+    if found.worst.beyond < -_SLOW_ALLOWANCE:
+        return found
+    rows, boxes = setpoint_rows(state), found.boxes
+    snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, None))
+    _look_again(boxes, rows, snapshots, limits, _SLOW_ALLOWANCE)
+    return _judge(found.time, state.position, boxes, limits, snapshots)
 
 
 def link_loss_within_stops(
@@ -171,7 +172,8 @@ def link_loss_within_stops(
     some = slice(_middle(limits), _middle(limits) + 1) if coarsely else slice(None)
     airframes, step = _airframes(limits)[some], _FIRST_STEP if coarsely else _STEP
     snapshots = _flown_each(rows, limits, airframes, rate, starts[some])[:, forks]
-    boxes = _swept(_Forks(rows.reshape(-1, SETPOINT_SIZE), np.flatnonzero(forks), snapshots, airframes), limits, step)
+    lost = _Forks(rows.reshape(-1, SETPOINT_SIZE), np.flatnonzero(forks), snapshots, airframes, step)
+    boxes = _swept(lost, limits)
     times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
     return _judge(times, places, boxes, limits, np.empty((len(starts), 0, SNAPSHOT_SIZE)))
 
@@ -228,51 +230,64 @@ def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -
     number, middle = np.arange(len(rows)), _middle(limits)
     some = (number % every == 0) | (number == len(rows) - 1)
     airframe = _airframes(limits)[middle : middle + 1]
-    boxes = _swept(_Forks(rows, number[some], snapshots[None, some], airframe), limits, _FIRST_STEP)
+    boxes = _swept(_Forks(rows, number[some], snapshots[None, some], airframe, _FIRST_STEP), limits)
     after = np.searchsorted(number[some], number)
     return _united([boxes[np.where(some, after, after - 1)], boxes[after]])
 
 
+def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, allowance: float) -> NDArray:
+    """Replace the boxes, (N, S, 2, 3), that a first look says to end within `allowance`, m, of a wall; return these.
+
+    `snapshots` are (L, N, 31).
+    """
+    beyond, _ = limits.space.swept(boxes)
+    near: NDArray = ~(beyond + allowance < 0.0)
+    boxes[near] = _swept(_Forks(rows, np.flatnonzero(near), snapshots[:, near], _airframes(limits)), limits)
+    return near
+
+
 class _Forks(NamedTuple):
-    """Where the link is lost."""
+    """Where the link is lost, and how closely that is looked at."""
 
     setpoints: NDArray  # (N, 20)
     rows: NDArray  # (F,) int, the last setpoints
     snapshots: NDArray  # (L, F, 31) when they arrive
     airframes: NDArray  # (L, 26)
+    step: int = _STEP  # ms; a first look has _FIRST_STEP
 
 
-def _swept(forks: _Forks, limits: Limits, step: int = _STEP) -> NDArray:
-    """Return the boxes, (F, S, 2, 3) m, that all vehicles sweep from the forks; by steps, ms."""
+def _swept(forks: _Forks, limits: Limits) -> NDArray:
+    """Return the boxes, (F, S, 2, 3) m, that all vehicles sweep from the forks."""
     error = limits.link_loss.vertical_acceleration_error
-    swept = _united([_fall(forks, limits, step), _go_on(forks, limits, step, error)])
+    swept = _united([_fall(forks, limits), _go_on(forks, limits, error)])
     beyond, _ = limits.space.swept(swept)
     near = ~(beyond < -_NEAR)
-    if error and near.any():
+    if error and forks.step == _STEP and near.any():
         some = forks._replace(rows=forks.rows[near], snapshots=forks.snapshots[:, near])
-        swept[near] = _united([swept[near], _go_on(some, limits, step, -error)])
+        swept[near] = _united([swept[near], _go_on(some, limits, -error)])
     return swept
 
 
-def _go_on(forks: _Forks, limits: Limits, step: int, error: float) -> NDArray:
+def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
     """Let vehicles fly on with their last setpoints; the accelerometer says `error`, m/s², too little."""
-    off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
+    off, step = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER, forks.step
     level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
-    return _leave(forks, limits, error, _alone(forks, limits, step)._replace(
+    return _leave(forks, limits, error, _alone(forks, limits)._replace(
         level_after=level, off_after=off, spread=_drift(limits, off, step)
     ))  # fmt: skip
 
 
-def _fall(forks: _Forks, limits: Limits, step: int) -> NDArray:
-    """Let the motors stop at once, with every motor lag, also where the flight before was with one."""
-    airframes = _airframes(limits)
+def _fall(forks: _Forks, limits: Limits) -> NDArray:
+    """Let the motors stop at once; a first look is at both extremes of motor lag, though the flight before was not."""
+    airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
     snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
     forks = forks._replace(snapshots=snapshots, airframes=airframes)
-    return _leave(forks, limits, 0.0, _alone(forks, limits, step)._replace(off_after=0))
+    return _leave(forks, limits, 0.0, _alone(forks, limits)._replace(off_after=0))
 
 
-def _alone(forks: _Forks, limits: Limits, step: int) -> Schedule:
+def _alone(forks: _Forks, limits: Limits) -> Schedule:
     arrivals, gains = np.zeros(len(forks.setpoints), dtype=np.int64), gains_for(limits.airframe).pack()
+    step = forks.step
     return Schedule(forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step)
 
 

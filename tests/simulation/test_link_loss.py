@@ -271,8 +271,10 @@ def test_slow_motion_looked_at_coarsely_is_what_a_whole_simulation_gives_and_nea
         assert found.worst.beyond == pytest.approx(whole.worst.beyond, abs=0.01)
     fast = hover_to_hover((edge + 1.0, 0.0, 0.5), 0.0, (edge, 0.0, 1.0), 0.0, 1.1, RATE)
     payloads = encode_motion(fast, ahead(fast.acceleration, RATE), gains_under(limits), space=limits.space)
-    found = link_loss_of_slow_motion(payloads, limits)
-    np.testing.assert_array_equal(found.beyond, link_loss_at_every_setpoint(payloads, limits).beyond)
+    found, whole = link_loss_of_slow_motion(payloads, limits), link_loss_at_every_setpoint(payloads, limits)
+    near = whole.beyond > -0.05
+    assert near.any()
+    np.testing.assert_array_equal(found.beyond[near], whole.beyond[near])
 
 
 def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):
