@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.engine.body import TIME_STEP
-from cfplan.simulation.engine.flight import NO_FLOOR, PERFECT, ClosedLoop, Conditions, EstimateErrors, fly_setpoints
+from cfplan.simulation.engine.flight import AS_PLANNED, ClosedLoop, Conditions, fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.engine.mellinger import FULL_COMMAND
 from cfplan.vehicle.airframe import Airframe
@@ -102,20 +101,16 @@ def dry_run(
     airframe: Airframe,
     limits: FlightLimits,
     *,
-    believed: Airframe | None = None,
-    delay: float = 0.0,
-    estimate: EstimateErrors = PERFECT,
+    conditions: Conditions = AS_PLANNED,
     snapshot: NDArray | None = None,
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
-    `believed` is the airframe for which the controller is tuned, the same where not given; `delay`, s, makes every
-    setpoint late; `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The
-    real-time factor counts everything but the compilation at the first call ever.
+    `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The real-time factor
+    counts everything but the compilation at the first call ever.
     """
     start = trajectory.at(0.0)
     begin = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot
-    conditions = Conditions(gains_for(believed or airframe), NO_FLOOR, delay, estimate)
     fly = partial(
         fly_setpoints, decode(encoded.payloads), encoded.times, airframe, begin, conditions=conditions
     )  # fmt: skip
@@ -142,7 +137,7 @@ def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float
     """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
     times = np.arange(len(payloads)) / rate
     duration = times[-1] + SETTLING
-    return fly_setpoints(decode(payloads), times, airframe, snapshot, duration, Conditions(floor=NO_FLOOR))
+    return fly_setpoints(decode(payloads), times, airframe, snapshot, duration)
 
 
 def fly_and_judge(

@@ -13,7 +13,7 @@ from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
 from cfplan.flight.on_board.pieces import RATE, Pieces, goals_at
 from cfplan.safety.limits import FlightLimits
 from cfplan.simulation.dry_run import SETTLING, DryRun, fly_and_judge
-from cfplan.simulation.engine.flight import NO_FLOOR, Conditions, fly_setpoints
+from cfplan.simulation.engine.flight import Conditions, fly_setpoints
 from cfplan.simulation.engine.layout import SETPOINT_SIZE, hovering
 from cfplan.vehicle.airframe import Airframe
 
@@ -25,7 +25,7 @@ def on_board_run(flight: OnBoardTrajectory, airframe: Airframe, limits: FlightLi
     rows = goal_rows(pieces, times)
     start = hovering(airframe, rows[0, :3], float(rows[0, 18]))
 
-    conditions = Conditions(floor=NO_FLOOR, on_board=True)
+    conditions = Conditions(on_board=True)
     fly = partial(fly_setpoints, rows, times, airframe, start, conditions=conditions)
     duration = pieces.duration + SETTLING
     return fly_and_judge(fly, duration, lambda at: flight.reference.plan_at(at)[:, 0, :3], pieces.duration, limits)

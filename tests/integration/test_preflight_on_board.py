@@ -154,7 +154,7 @@ def test_gains_that_may_fly_fly_what_the_dry_run_flew():
             LIMITS.airframe,
             hovering(LIMITS.airframe, state.position, float(state.yaw)),
             duration=trajectory.duration,
-            conditions=Conditions(gains, floor=-1e9),
+            conditions=Conditions(gains),
         )
         return np.linalg.norm(loop.position - trajectory.at(loop.time).position, axis=1).max()
 

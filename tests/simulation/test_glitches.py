@@ -10,7 +10,7 @@ import pytest
 from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.engine.flight import NO_FLOOR, Conditions, fly_setpoints
+from cfplan.simulation.engine.flight import fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.glitches import (
     AFTERWARDS,
@@ -47,7 +47,7 @@ def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap
     held = np.where((rows > number) & (rows < number + round(100 * GAP)), number, rows)
     start = hovering(limits.airframe, decode(line).position[0])
     end = number / 100 + GAP + AFTERWARDS
-    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, end, Conditions(floor=NO_FLOOR))
+    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, end)
     since = np.arange(10 * number, round(1000 * end))
     due = decode(line).position[np.minimum(since // 10, len(line) - 1)]
     off = np.linalg.norm(flown.position[since] - due, axis=1).max()
@@ -67,7 +67,6 @@ def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limit
         limits.airframe,
         start,
         duration=end,
-        conditions=Conditions(floor=NO_FLOOR),
     )
     since = np.arange(round(1000 * end))
     off = np.linalg.norm(

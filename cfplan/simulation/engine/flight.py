@@ -50,7 +50,7 @@ class Conditions:
     """What a flight meets; as planned unless said."""
 
     gains: MellingerGains | None = None  # of the controller; the airframe's where not given
-    floor: float = 0.0  # m
+    floor: float = NO_FLOOR  # m
     delay: float = 0.0  # s by which setpoints are late
     estimate: EstimateErrors = PERFECT
     wind: NDArray = field(default_factory=lambda: STILL_AIR)  # (3,) m/s

@@ -25,6 +25,7 @@ from cfplan.machine_code import njit
 from cfplan.simulation.engine.body import move, stay_above_floor
 from cfplan.simulation.engine.layout import (
     AIRFRAME,
+    AIRFRAME_SIZE,
     ASKED,
     FLOOR,
     MISSED,
@@ -122,130 +123,143 @@ def _split(batch: Vehicles, found: Outcome, work: int) -> Iterator[tuple[Vehicle
         yield Vehicles(*(each[some] for each in batch)), Outcome(*(each[some] for each in found))
 
 
+class _Lanes(NamedTuple):
+    """Vehicles of a batch that are flown at once."""
+
+    values: NDArray  # (_ROWS * WIDTH,) as in `layout`
+    newest: NDArray  # (WIDTH,) int, row of the setpoint that is due
+    first: int  # number of the vehicle in the first lane
+    size: int  # how many of the lanes are used
+
+
 @njit(nogil=True, error_model="numpy")
 def _run(batch: Vehicles, schedule: Schedule, found: Outcome) -> None:
-    lanes, newest = np.zeros(_ROWS * WIDTH), np.zeros(WIDTH, dtype=np.int64)
+    values, newest = np.zeros(_ROWS * WIDTH), np.zeros(WIDTH, dtype=np.int64)
     for first in range(0, len(batch.snapshots), WIDTH):
-        _run_lanes(lanes, newest, batch, schedule, found, first)
+        _fly(_Lanes(values, newest, first, min(WIDTH, len(batch.snapshots) - first)), batch, schedule, found)
 
 
 @njit(allocates=False, error_model="numpy")
-def _run_lanes(
-    lanes: NDArray, newest: NDArray, batch: Vehicles, schedule: Schedule, found: Outcome, first: int
-) -> None:
-    """Run as many vehicles as there are lanes, from number `first` on."""
-    count = min(WIDTH, len(batch.snapshots) - first)
-    _begin(lanes, newest, count, batch, schedule, first)
-    _fly(lanes, newest, count, batch, schedule, found, first)
-    for n in range(count):
-        found.deviation[first + n] = np.sqrt(lanes[_FARTHEST * WIDTH + n])
-        found.tilt[first + n] = np.arccos(min(max(lanes[_LEAST_LIFT * WIDTH + n], -1.0), 1.0))
-
-
-@register_jitable
-def _begin(lanes: NDArray, newest: NDArray, count: int, batch: Vehicles, schedule: Schedule, first: int) -> None:
-    """Put vehicles into lanes."""
-    for n in range(count):
-        for row in range(SNAPSHOT_SIZE):
-            lanes[row * WIDTH + n] = batch.snapshots[first + n, row]
-        for row in range(batch.airframes.shape[1]):
-            lanes[(AIRFRAME + row) * WIDTH + n] = batch.airframes[first + n, row]
-        for k in range(3):
-            lanes[(_LOW + k) * WIDTH + n] = lanes[(_HIGH + k) * WIDTH + n] = batch.snapshots[first + n, k]
-            lanes[(_BLIND + k) * WIDTH + n] = batch.blind[first + n, k]
-        for row in range(MISSED, MISSED + 6):
-            lanes[row * WIDTH + n] = 0.0
-        lanes[_FARTHEST * WIDTH + n], lanes[_LEAST_LIFT * WIDTH + n] = 0.0, 1.0
-        newest[n] = batch.first[first + n]
-        _take_setpoint(lanes, n, schedule.setpoints[newest[n]])
-        _note_due(lanes, n, schedule.setpoints[newest[n]])
-
-
-@register_jitable
-def _fly(
-    lanes: NDArray, newest: NDArray, count: int, batch: Vehicles, schedule: Schedule, found: Outcome, first: int
-) -> None:  # seven, as numba knows no objects
-    """Fly the vehicles of all lanes; `first` is the number of the first one."""
-    used, step, part, due_at = padded(count), 0.001 * schedule.step, 0, 1
-    for n in range(count):
-        _note_arrival(lanes, n, found, first + n, 0)
+def _fly(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome) -> None:
+    """Fly the vehicles of all lanes."""
+    values, used, step, part = lanes.values, padded(lanes.size), 0.001 * schedule.step, 0
+    _begin(lanes, batch, schedule)
+    due_at = 0
     for k in range(schedule.steps):
         now = k * schedule.step
         if now >= due_at:
-            due_at = NEVER
-            for n in range(count):
-                due_at = min(due_at, _receive(lanes, newest, n, batch, schedule, found, first + n, now))
+            due_at = _receive(lanes, batch, schedule, found, now)
         if len(found.trace) > 0:
-            for n in range(count):
-                _read_snapshot(found.trace[first + n, k], lanes, n)
-        _miss(lanes, used, 0.001 * now if now < schedule.blind_until else 0.0)
+            _note_step(lanes, found, k)
+        _miss(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
         if schedule.latency > 0 or len(schedule.noise) > 0:
-            _err(lanes, count, schedule, found, first, k)
-        if now == schedule.level_after:
-            for n in range(count):
-                lanes[(SETPOINT + 15) * WIDTH + n] = 0.0
-        if now == schedule.off_after:
-            for row in range(ASKED, ASKED + 4):
-                for n in range(count):
-                    lanes[row * WIDTH + n] = 0.0
-        elif now < schedule.off_after and now % schedule.control == 0:
+            _err(lanes, schedule, found, k)
+        _supervise(values, schedule, now)
+        if now < schedule.off_after and now % schedule.control == 0:
             levels, period = now >= schedule.level_after, 0.001 * schedule.control
-            _control(lanes, used, schedule.gains, period, schedule.on_board, levels)
-        _move(lanes, used, step)
-        down = _count_down(lanes, count)
+            _control(values, used, schedule.gains, period, schedule.on_board, levels)
+        _move(values, used, step)
+        down = _count_down(values, lanes.size)
         if down > 0:
-            for n in range(count):
-                stay_above_floor(lanes, WIDTH, n, step)
-        aside = schedule.spread[min(k, len(schedule.spread) - 1)]
-        _reduce(lanes, used, aside)
-        after = min((now + schedule.step) // PART, found.boxes.shape[1] - 1)
-        if after != part:
-            for n in range(count):
-                _next_part(lanes, n, found.boxes[first + n, part])
-            _reduce(lanes, used, aside)
-            part = after
-        if now >= schedule.off_after and down == count:
+            for n in range(lanes.size):
+                stay_above_floor(values, WIDTH, n, step)
+        part = _reduce(lanes, used, schedule, found, k, part)
+        if now >= schedule.off_after and down == lanes.size:
             break
-    for each in range(part, found.boxes.shape[1]):
-        for n in range(count):
-            _write_box(found.boxes[first + n, each], lanes, n)
+    _end(lanes, found, part)
 
 
 @register_jitable
-def _receive(
-    lanes: NDArray, newest: NDArray, n: int, batch: Vehicles, schedule: Schedule, found: Outcome, number: int, now: int
-) -> int:  # eight, as numba knows no objects
-    """Let the setpoints of a lane arrive that are due; return when, ms, there is something to receive again."""
-    begun, last, deaf_until = schedule.arrivals[batch.first[number]], batch.last[number], batch.deaf_until[number]
-    before = newest[n]
-    while newest[n] < last and schedule.arrivals[newest[n] + 1] - begun <= now:
-        newest[n] += 1
-    came = newest[n] > before
-    if came:
-        _note_due(lanes, n, schedule.setpoints[newest[n]])
-        _note_arrival(lanes, n, found, number, newest[n] - batch.first[number])
-    if (came and now >= deaf_until) or now == deaf_until:
-        _take_setpoint(lanes, n, schedule.setpoints[newest[n]])
-    next_one = schedule.arrivals[newest[n] + 1] - begun if newest[n] < last else NEVER
-    return min(next_one, deaf_until) if now < deaf_until else next_one
+def _begin(lanes: _Lanes, batch: Vehicles, schedule: Schedule) -> None:
+    """Put vehicles into lanes."""
+    values = lanes.values
+    for n in range(lanes.size):
+        number = lanes.first + n
+        for row in range(SNAPSHOT_SIZE):
+            values[row * WIDTH + n] = batch.snapshots[number, row]
+        for row in range(AIRFRAME_SIZE):
+            values[(AIRFRAME + row) * WIDTH + n] = batch.airframes[number, row]
+        for k in range(3):
+            values[(_LOW + k) * WIDTH + n] = values[(_HIGH + k) * WIDTH + n] = batch.snapshots[number, k]
+            values[(_BLIND + k) * WIDTH + n] = batch.blind[number, k]
+        values[_FARTHEST * WIDTH + n], values[_LEAST_LIFT * WIDTH + n] = 0.0, 1.0
+        lanes.newest[n] = batch.first[number]
+        _take_setpoint(values, n, schedule.setpoints[lanes.newest[n]])
 
 
 @register_jitable
-def _take_setpoint(lanes: NDArray, n: int, setpoint: NDArray) -> None:
+def _receive(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome, now: int) -> int:
+    """Let the setpoints arrive that are due, and note snapshots; return when, ms, there is something to do again."""
+    again = NEVER
+    for n in range(lanes.size):
+        number, newest = lanes.first + n, lanes.newest[n]
+        first, last, deaf_until = batch.first[number], batch.last[number], batch.deaf_until[number]
+        begun = schedule.arrivals[first]
+        while newest < last and schedule.arrivals[newest + 1] - begun <= now:
+            newest += 1
+        if newest > lanes.newest[n] or now == 0:
+            for k in range(3):
+                lanes.values[(_DUE + k) * WIDTH + n] = schedule.setpoints[newest, k]
+            if newest - first < found.arrived.shape[1]:
+                _read_snapshot(found.arrived[number, newest - first], lanes.values, n)
+        if now == deaf_until or (newest > lanes.newest[n] and now > deaf_until):
+            _take_setpoint(lanes.values, n, schedule.setpoints[newest])
+        lanes.newest[n] = newest
+        if newest < last:
+            again = min(again, schedule.arrivals[newest + 1] - begun)
+        if now < deaf_until:
+            again = min(again, deaf_until)
+    return again
+
+
+@register_jitable
+def _note_step(lanes: _Lanes, found: Outcome, k: int) -> None:
+    for n in range(lanes.size):
+        _read_snapshot(found.trace[lanes.first + n, k], lanes.values, n)
+
+
+@register_jitable
+def _supervise(values: NDArray, schedule: Schedule, now: int) -> None:
+    """Level out, or stop the motors."""
+    if now == schedule.level_after:
+        for n in range(WIDTH):
+            values[(SETPOINT + 15) * WIDTH + n] = 0.0
+    if now == schedule.off_after:
+        for row in range(ASKED, ASKED + 4):
+            for n in range(WIDTH):
+                values[row * WIDTH + n] = 0.0
+
+
+@register_jitable
+def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int, part: int) -> int:
+    """Reduce what step k has come to; return the number of the box that it goes on in."""
+    aside = schedule.spread[min(k, len(schedule.spread) - 1)]
+    _widen(lanes.values, used, aside)
+    after = min((k + 1) * schedule.step // PART, found.boxes.shape[1] - 1)
+    if after != part:
+        for n in range(lanes.size):
+            _write_box(found.boxes[lanes.first + n, part], lanes.values, n)
+            write_vector(lanes.values, WIDTH, n, _LOW, (np.inf, np.inf, np.inf))
+            write_vector(lanes.values, WIDTH, n, _HIGH, (-np.inf, -np.inf, -np.inf))
+        _widen(lanes.values, used, aside)
+    return after
+
+
+@register_jitable
+def _end(lanes: _Lanes, found: Outcome, part: int) -> None:
+    """Write what was reduced; boxes of the time that is left are where the vehicle lies."""
+    for n in range(lanes.size):
+        number = lanes.first + n
+        for each in range(part, found.boxes.shape[1]):
+            _write_box(found.boxes[number, each], lanes.values, n)
+        found.deviation[number] = np.sqrt(lanes.values[_FARTHEST * WIDTH + n])
+        found.tilt[number] = np.arccos(min(max(lanes.values[_LEAST_LIFT * WIDTH + n], -1.0), 1.0))
+
+
+@register_jitable
+def _take_setpoint(values: NDArray, n: int, setpoint: NDArray) -> None:
     for k in range(SETPOINT_SIZE):
-        lanes[(SETPOINT + k) * WIDTH + n] = setpoint[k]
-
-
-@register_jitable
-def _note_due(lanes: NDArray, n: int, setpoint: NDArray) -> None:
-    for k in range(3):
-        lanes[(_DUE + k) * WIDTH + n] = setpoint[k]
-
-
-@register_jitable
-def _note_arrival(lanes: NDArray, n: int, found: Outcome, number: int, setpoint: int) -> None:
-    if len(found.arrived) > 0 and setpoint < found.arrived.shape[1]:
-        _read_snapshot(found.arrived[number, setpoint], lanes, n)
+        values[(SETPOINT + k) * WIDTH + n] = setpoint[k]
 
 
 @register_jitable
@@ -266,13 +280,14 @@ def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
 
 
 @register_jitable
-def _err(lanes: NDArray, count: int, schedule: Schedule, found: Outcome, first: int, k: int) -> None:
+def _err(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
     """Let all estimates be late and noisy besides."""
     seen = max(k - schedule.latency // schedule.step, 0)
-    for n in range(count):
+    for n in range(lanes.size):
         for row in range(6):
-            late = lanes[row * WIDTH + n] - found.trace[first + n, seen, row]
-            lanes[(MISSED + row) * WIDTH + n] += late - (schedule.noise[k, row] if len(schedule.noise) > 0 else 0.0)
+            late = lanes.values[row * WIDTH + n] - found.trace[lanes.first + n, seen, row]
+            noise = schedule.noise[k, row] if len(schedule.noise) > 0 else 0.0
+            lanes.values[(MISSED + row) * WIDTH + n] += late - noise
 
 
 @njit(allocates=False, error_model="numpy")
@@ -318,7 +333,7 @@ def _count_down(lanes: NDArray, count: int) -> int:
 
 
 @njit(allocates=False, error_model="numpy")
-def _reduce(lanes: NDArray, count: int, aside: float) -> None:
+def _widen(lanes: NDArray, count: int, aside: float) -> None:
     """Note what each vehicle has come to: `aside`, m, widens its box, unless it stands on the floor."""
     count = min(count, WIDTH)
     for n in range(count):
@@ -346,14 +361,6 @@ def _lower(value: float, other: float) -> float:
 @register_jitable(forceinline=True)
 def _higher(value: float, other: float) -> float:
     return value if value >= other else other
-
-
-@register_jitable
-def _next_part(lanes: NDArray, n: int, box: NDArray) -> None:
-    """Write a box, and begin the next one."""
-    _write_box(box, lanes, n)
-    write_vector(lanes, WIDTH, n, _LOW, (np.inf, np.inf, np.inf))
-    write_vector(lanes, WIDTH, n, _HIGH, (-np.inf, -np.inf, -np.inf))
 
 
 @register_jitable

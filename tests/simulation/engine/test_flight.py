@@ -7,7 +7,7 @@ import pytest
 
 from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.simulation.engine.flight import NO_FLOOR, Conditions, EstimateErrors, fly_setpoints
+from cfplan.simulation.engine.flight import Conditions, EstimateErrors, fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.airframes import AIRFRAMES
@@ -41,7 +41,7 @@ def test_the_firmwares_flights_are_flown_again_to_a_hundredth_of_a_millimetre(fi
         airframe,
         start,
         duration=float(flown["t"][-1]),
-        conditions=Conditions(MellingerGains(mass=airframe.mass), NO_FLOOR),
+        conditions=Conditions(MellingerGains(mass=airframe.mass)),
     )
     rows = slice(None, None, 10)
     assert loop.time[rows] == pytest.approx(flown["t"], abs=1e-6)
@@ -75,7 +75,6 @@ def test_yaw_would_be_unstable_at_this_motor_lag_without_the_rotors_reaction():
             replace(bare, motor_time_constant=lag),
             start,
             duration=6.0,
-            conditions=Conditions(floor=NO_FLOOR),
         )
         early, late = (np.abs(loop.body_rate[part, 2]).max() for part in (slice(1000, 2000), slice(5000, 6000)))
         growth.append(late / early)
@@ -98,7 +97,7 @@ def test_it_takes_off_from_the_floor_and_lands_on_it():
     )
     start = hovering(AIRFRAME, np.zeros(3))
     start[13:17] = 0.0
-    loop = fly_setpoints(setpoints, seconds, AIRFRAME, start, duration=8.0)
+    loop = fly_setpoints(setpoints, seconds, AIRFRAME, start, 8.0, Conditions(floor=0.0))
     assert loop.position[:, 2].min() == 0.0
     assert loop.position[2500, 2] == pytest.approx(0.5, abs=0.05)
     assert loop.position[-1, 2] == 0.0
