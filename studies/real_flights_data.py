@@ -76,7 +76,6 @@ def read_flight(file: Path) -> PublicFlight:
         control=_control(data, family),
         acceleration=data.get("acc"),
         voltage=data.get("vbat"),
-        desired_rate=rates,
         **_poses(data, zero),
     )
     rows = np.zeros((len(log.time), REFERENCE_SIZE))

@@ -34,7 +34,7 @@ class FlightLog:
     acceleration: NDArray | None = None  # (N, 3) m/s², specific force in body axes
     voltage: NDArray | None = None  # (N,) V
     setpoint: NDArray | None = None  # (N, 6) m, m/s, as logged by the controller
-    desired_rate: NDArray | None = None  # (N, 3) rad/s, the controller's
+    setpoint_yaw: NDArray | None = None  # (N,) rad, likewise
     pose_time: NDArray = field(default_factory=partial(np.empty, 0))  # (M,) s
     poses: NDArray = field(default_factory=partial(np.empty, (0, 7)))
     """(M, 7) m and quaternion x y z w, which is zero where motion capture gives no attitude."""
@@ -60,11 +60,18 @@ class FlightLog:
         return Rotation.from_quat(self.state[:, 6:10])
 
     def between(self, begin: float, end: float) -> "FlightLog":
-        """Return the part from one time to another, s; its times count from its first record."""
+        """Return the part from one time to another, s; its times count from its first record.
+
+        Raises InputError where there is none.
+        """
         keep = (self.time >= begin) & (self.time <= end)
+        if not keep.any():
+            message = f"nothing between {begin:g} and {end:g} s"
+            hint = f"it lasts {self.duration:.1f} s: --from and --to lie in it"
+            raise InputError(message, where=self.name, hint=hint)
         zero = float(self.time[keep][0])
         part = {
-            name: value[keep] for name in ("state", "control", "acceleration", "voltage", "setpoint", "desired_rate")
+            name: value[keep] for name in ("state", "control", "acceleration", "voltage", "setpoint", "setpoint_yaw")
             if (value := getattr(self, name)) is not None
         }  # fmt: skip
         seen = (self.pose_time >= zero) & (self.pose_time <= end)
@@ -133,7 +140,7 @@ def read_microsd(file: Path) -> FlightLog:
         acceleration=_columns(table, "acc", "xyz", GRAVITY),
         voltage=table.get("pm.vbat"),
         setpoint=_columns(table, "ctrltargetZ", ("x", "y", "z", "vx", "vy", "vz"), 1e-3),
-        desired_rate=_columns(table, "ctrlLee", ("omegarx", "omegary", "omegarz")),
+        setpoint_yaw=table.get("ctrlLee.rpydz"),
         pose_time=pose_time,
         poses=poses,
     )

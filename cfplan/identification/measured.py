@@ -41,6 +41,7 @@ class Measured:
     airframe: Airframe
     found: dict[str, str]  # quantity: value with its unit, and how well it is known
     unknown: tuple[str, ...]  # quantities that the log does not show, each with the reason
+    unlike: tuple[str, ...]  # how it differs from the airframe that was named, by more than its spread
     estimate: dict[str, float]  # errors of the estimate against motion capture: rms of m, m/s and rad; empty if unknown
 
 
@@ -54,6 +55,7 @@ class _Smooth:
     torque: NDArray  # (K, 3) N m, as asked for, not smoothed
     thrust: NDArray  # (K,) N, as asked for, not smoothed
     force: NDArray | None  # (K, 3) m/s²
+    seen: bool  # whether the velocity is motion capture's: the estimated one is too high
     along: NDArray  # (K,) m/s², specific force along the thrust axis: of the accelerometer, or of the climb
 
 
@@ -102,7 +104,23 @@ def measure(log: FlightLog, airframe: Airframe) -> Measured:
         known = by(columns, known, found, unknown)
     known = replace(known, thrust_scale=thrust_scale(log, known))
     found["thrust scale"] = f"{known.thrust_scale:.3f} of what is asked for, in the first {HOVER:g} s"
-    return Measured(known, found, tuple(unknown), _errors_of_estimate(log))
+    return Measured(known, found, tuple(unknown), tuple(unlike(known, airframe)), _errors_of_estimate(log))
+
+
+def unlike(found: Airframe, kind: Airframe) -> list[str]:
+    """Return in words what is farther from an airframe than its spread allows: it may be another vehicle's flight."""
+    pairs = [
+        ("thrust scale", found.thrust_scale, kind.thrust_scale, kind.spread.thrust_scale),
+        ("drag over mass", found.drag[0] / found.mass, kind.drag[0] / kind.mass, kind.spread.drag),
+        ("roll moment", found.velocity_moment[0], kind.velocity_moment[0], kind.spread.velocity_moment),
+        ("pitch moment", found.velocity_moment[1], kind.velocity_moment[1], kind.spread.velocity_moment),
+        ("motor lag", found.motor_time_constant, kind.motor_time_constant, kind.spread.motor_time_constant),
+    ]
+    return [
+        f"{name} {value:.3g}, outside {usual:.3g} ± {spread:.0%} of {kind.name}"
+        for name, value, usual, spread in pairs
+        if abs(value - usual) > spread * usual
+    ]
 
 
 def pooled(flights: Sequence[Measured], airframe: Airframe) -> Airframe:
@@ -151,7 +169,7 @@ def _smoothed(log: FlightLog) -> _Smooth:
     climb = gaussian_filter1d(on_grid(log.state[:, 5])[:, 0], _CLIMB_SMOOTHING / _PERIOD)
     return _Smooth(
         keep, velocity, smooth(log.state[:, 10:13]), on_grid(log.control[:, 1:]),
-        on_grid(log.control[:, 0])[:, 0], force,
+        on_grid(log.control[:, 0])[:, 0], force, _has_poses(log),
         (np.gradient(climb, _PERIOD) + GRAVITY) / up if force is None else force[:, 2],
     )  # fmt: skip
 
@@ -193,7 +211,8 @@ def _by_torque(columns: _Smooth, known: Airframe, found: dict[str, str], unknown
         slope, held, fit, deviation = fits[lag][axis]
         if axis in axes and fit > _LEAST_FIT and _within(slope, _INERTIAS) and _within(held, _MOMENTS):
             moment[axis], inertia[axis] = held, slope
-            found[f"{name} moment"] = f"{1e4 * held:.2f} ± {1e4 * deviation:.2f} e-4 N m per m/s ({fit:.0%} explained)"
+            text = f"{1e4 * held:.2f} ± {1e4 * deviation:.2f} e-4 N m per m/s ({fit:.0%} explained)"
+            found[f"{name} moment"] = text if columns.seen else f"{text}, low by a tenth or two: without motion capture"
             found[f"{name} inertia"] = f"{1e5 * slope:.2f} e-5 kg m²"
         else:
             unknown.append(f"{name} moment: {'flown too slowly' if axis not in axes else 'the torque is another'}")

@@ -1,6 +1,7 @@
 """The motion that a logged flight was to follow: of polynomials, a plan, or the logged setpoints themselves."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from math import factorial
 from pathlib import Path
 
@@ -11,13 +12,12 @@ from scipy.signal import savgol_filter
 from cfplan.errors import InputError
 from cfplan.geometry.polynomial_csv import read_polynomial_rows
 from cfplan.simulation.engine.lee import REFERENCE_SIZE
-from cfplan.vehicle.rotations import yaw_of
 from cfplan.vehicle.trajectory import Trajectory
 
 SETPOINT_PERIOD = 0.010  # s, at which the vehicle's commander, or the stream, renews the setpoint
 POSITION, YAW = slice(0, 3), 12  # columns of a reference's rows
 _STEP = 0.005  # s, of the samples
-_SMOOTHING = 0.10  # s, over which logged setpoints, a staircase of 10 ms and 1 mm, are smoothed to differentiate them
+_SMOOTHING = 0.20  # s, over which logged setpoints, a staircase of 10 ms and 1 mm, are smoothed to differentiate them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,6 +27,9 @@ class Reference:
     source: str
     time: NDArray  # (K,) s
     rows: NDArray  # (K, 14) as in `lee`: position, velocity, acceleration, jerk, yaw, yaw rate
+    sent_time: NDArray = field(default_factory=partial(np.empty, 0))  # (L,) s
+    sent: NDArray = field(default_factory=partial(np.empty, (0, 20)))
+    """(L, 20) full-state setpoints as `mellinger` takes them, where a computer streamed them."""
 
     def at(self, time: NDArray) -> NDArray:
         """Return the reference, (N, 14), at these times, s."""
@@ -39,7 +42,11 @@ class Reference:
         """Return the reference begun `start` s later, `offset` (3,) m farther."""
         rows = self.rows.copy()
         rows[:, POSITION] += offset
-        return replace(self, time=self.time + start, rows=rows)
+        return replace(self, time=self.time + start, rows=rows, sent_time=self.sent_time + start)
+
+    def sent_at(self, time: NDArray) -> NDArray:
+        """Return the full-state setpoint, (N, 20), that is in force at each time."""
+        return self.sent[np.searchsorted(self.sent_time, time, side="right").clip(1) - 1]
 
 
 def reference_of_polynomials(file: Path, time_scale: float = 1.0) -> Reference:
@@ -77,8 +84,8 @@ def reference_of_trajectory(trajectory: Trajectory, name: str) -> Reference:
     return Reference(name, time, rows)
 
 
-def reference_of_setpoints(time: NDArray, setpoint: NDArray, quaternion: NDArray | None = None) -> Reference:
-    """Return the motion of logged setpoints: position and velocity, and acceleration where logged, (N, 6 or 9).
+def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None = None) -> Reference:
+    """Return the motion of logged setpoints: position, velocity, and acceleration where logged, (N, 6 or 9); yaw (N,).
 
     A vehicle logs them as a staircase, so each stands for the middle of the time that it holds. What is not logged is
     differentiated from what is.
@@ -94,7 +101,7 @@ def reference_of_setpoints(time: NDArray, setpoint: NDArray, quaternion: NDArray
     rows[:, 0:3], rows[:, 3:6] = smooth(known[:, 0:3]), smooth(known[:, 3:6])
     rows[:, 6:9] = smooth(known[:, 6:9]) if setpoint.shape[1] > 6 else smooth(known[:, 3:6], 1)
     rows[:, 9:12] = smooth(rows[:, 6:9], 1)
-    if quaternion is not None:
-        rows[:, YAW] = np.interp(grid, time, np.unwrap([yaw_of(each) for each in quaternion]))
+    if yaw is not None:
+        rows[:, YAW] = np.interp(grid, time, np.unwrap(yaw))
         rows[:, YAW + 1] = np.gradient(rows[:, YAW], grid)
     return Reference("logged setpoints", grid, rows)

@@ -19,7 +19,7 @@ from cfplan.machine_code import njit
 from cfplan.simulation.engine import layout, lee
 from cfplan.simulation.engine.layout import MEMORY, SETPOINT, SETPOINT_SIZE, VEHICLE_SIZE
 from cfplan.simulation.engine.lee import LeeGains, step_lee
-from cfplan.simulation.engine.mellinger import ON_BOARD, step_mellinger
+from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD, Modes, step_mellinger
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 LEAST_EXPLAINED = 0.95  # fraction of the commands' variance
@@ -28,7 +28,6 @@ _SMOOTHING = 0.008  # s, of both: records of state and command are not of the sa
 _SEARCHED = 0.5  # s, half the range in which the start is searched for finely
 _COARSE, _FINE = 0.020, 0.001  # s
 _FACTORS = (0.4, 2.5)  # range of the factors by which a gain may be wrong
-_TELLS = 0.02  # explained more by another gain, from which it is named
 JERK = slice(9, 12)  # columns of a reference's rows
 _ROUNDS, _LEAST_KNOWN = 3, 1e-6
 _INTEGRALS = np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])  # their usual size at the first record
@@ -60,6 +59,8 @@ class Controller:
 
     def setpoints(self, reference: Reference, time: NDArray) -> NDArray:
         """Return what it is given at these times, (N, 14) of Lee's or (N, 20) of Mellinger's."""
+        if not self.by_lee and len(reference.sent):
+            return reference.sent_at(time)
         rows = reference.at(time)
         if self.by_lee:
             if not self.feeds_jerk:
@@ -77,22 +78,23 @@ class Recomputed:
 
     control: NDArray  # (N, 4) thrust N, torque x y z N m
     memory: NDArray  # of the controller at the first record, as fitted
-    thrust: float  # fraction of the logged variance that it explains
+    thrust: float  # fraction of the logged variance that it explains; NaN where not logged
     torque: float  # the same of roll and pitch together
 
     @property
     def explained(self) -> float:
         """Return the smaller of both fractions."""
-        return min(self.thrust, self.torque)
+        return float(np.nanmin([self.thrust, self.torque]))
 
 
 def recompute(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
-    """Return the commands that a controller gives for the logged state; of what was not logged, zeros explained."""
+    """Return the commands that a controller gives for the logged state. Raises InputError where none were logged."""
     gains, setpoints = controller.gains.pack(), controller.setpoints(reference, log.time)
     size = lee.MEMORY_SIZE if controller.by_lee else layout.MEMORY_SIZE
     levers = np.array([airframe.arm, airframe.thrust_to_torque, getattr(controller.gains, "mass_thrust", 0.0)])
     width = _SMOOTHING / float(np.median(log.gaps))
     logged, control = log.control, np.zeros((len(log.time), 4))
+    mode = FULL_STATE if len(reference.sent) else ON_BOARD
     weight = controller.gains.mass * GRAVITY
     least = _LEAST_VARIED * weight * np.array([1.0, airframe.arm, airframe.arm, airframe.arm])
     spread = np.maximum(np.std(gaussian_filter1d(logged, width, axis=0), axis=0), least)
@@ -104,7 +106,7 @@ def recompute(log: FlightLog, reference: Reference, controller: Controller, airf
     def unexplained(values: NDArray) -> NDArray:
         memory = np.zeros(size)
         memory[free] = values
-        _replay(control, log.time, setpoints, log.state, gains, memory, levers, controller.by_lee)
+        _replay(control, log.time, setpoints, mode, log.state, gains, memory, levers, controller.by_lee)
         return np.asarray(((control - logged) / spread)[:, known].ravel())
 
     free = [k for k, gain in enumerate(_integral_gains(controller.gains)) if gain > 0.0]
@@ -115,26 +117,29 @@ def recompute(log: FlightLog, reference: Reference, controller: Controller, airf
         slopes = np.column_stack([unexplained(memory[free] + each) - now for each in step]) / np.diag(step)
         memory[free] -= np.linalg.lstsq(slopes, now, rcond=_LEAST_KNOWN)[0]
     unexplained(memory[free])
-    left = np.nan_to_num(np.var(gaussian_filter1d(control - logged, width, axis=0), axis=0))
+    left = np.var(gaussian_filter1d(control - logged, width, axis=0), axis=0)
     thrust, torque = 1.0 - left[0] / spread[0] ** 2, 1.0 - left[1:3].sum() / (spread[1:3] ** 2).sum()
     return Recomputed(control, memory, float(thrust), float(torque))
 
 
-def find_start(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Reference:
+def find_start(
+    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, offset: NDArray | None = None
+) -> Reference:
     """Return the reference begun when it was flown: where it explains the commands best.
 
-    A logged setpoint shows start and place directly. Without it the place is the reference's own in x and y. Its height
-    is that which the thrust asks for, or of the first record where an integral makes up for it.
+    A logged setpoint shows start and place directly. Else `offset`, (3,) m, is the place of its origin; without it x
+    and y are its own, and its height is that which the thrust asks for, or of the first record where an integral makes
+    up for it.
     """
     if log.setpoint is not None:
         return _found_by_setpoints(log, reference, log.setpoint)
-    offset = np.array([0.0, 0.0, log.state[0, 2] - reference.rows[0, 2]])
+    place = np.array([0.0, 0.0, log.state[0, 2] - reference.rows[0, 2]]) if offset is None else offset
     starts = np.arange(-reference.time[-1], log.duration, _COARSE)
-    apart = [_apart(log, reference.moved(start, offset)) for start in starts]
+    apart = [_apart(log, reference.moved(start, place)) for start in starts]
     best = float(starts[int(np.argmin(apart))])
 
-    begun = refine_start(log, reference.moved(best, offset), controller, airframe, _SEARCHED)
-    if isinstance(controller.gains, LeeGains) and controller.gains.Kpos_Iz == 0.0:
+    begun = refine_start(log, reference.moved(best, place), controller, airframe, _SEARCHED)
+    if offset is None and isinstance(controller.gains, LeeGains) and controller.gains.Kpos_Iz == 0.0:
         missing = np.mean(log.control[:, 0] - recompute(log, begun, controller, airframe).control[:, 0])
         begun = begun.moved(0.0, np.array([0.0, 0.0, missing / (controller.gains.mass * controller.gains.Kpos_Pz)]))
     return begun
@@ -156,9 +161,11 @@ def refine_start(
 
 
 def choose_jerk(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Controller:
-    """Return the controller with or without the jerk fed forward, whichever explains the torque better."""
-    both = [replace(controller, feeds_jerk=feeds) for feeds in (True, False)] if controller.by_lee else [controller]
-    return max(both, key=lambda each: recompute(log, reference, each, airframe).torque)
+    """Return the controller, or where only that explains the torque, the one whose firmware feeds jerk otherwise."""
+    if not controller.by_lee or recompute(log, reference, controller, airframe).torque >= LEAST_EXPLAINED:
+        return controller
+    other = replace(controller, feeds_jerk=not controller.feeds_jerk)
+    return other if recompute(log, reference, other, airframe).torque >= LEAST_EXPLAINED else controller
 
 
 def check_explained(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
@@ -166,11 +173,12 @@ def check_explained(log: FlightLog, reference: Reference, controller: Controller
     found = recompute(log, reference, controller, airframe)
     if found.explained >= LEAST_EXPLAINED:
         return found
-    likely, explained = likely_gain(log, reference, controller, airframe)
+    likely, explained = likely_cause(log, reference, controller, airframe)
     hint = (
-        f"with {likely} they would explain {explained:.1%}" if likely
-        else "no single gain explains it: check trajectory, time scale, start and the controller that flew"
-    )  # fmt: skip
+        f"with {likely} they would explain {explained:.1%}"
+        if explained >= LEAST_EXPLAINED
+        else "no single gain explains it, nor another start: check trajectory, time scale and the controller that flew"
+    )
     raise InputError(
         f"the stated gains explain {found.thrust:.1%} of the thrust and {found.torque:.1%} of the torque that was "
         f"logged; {LEAST_EXPLAINED:.0%} are needed",
@@ -179,10 +187,12 @@ def check_explained(log: FlightLog, reference: Reference, controller: Controller
     )
 
 
-def likely_gain(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> tuple[str, float]:
-    """Return the one gain that explains most if changed, as text with its value, and the fraction explained then."""
-    before = recompute(log, reference, controller, airframe).explained
-    best, text = before + _TELLS, ""
+def likely_cause(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> tuple[str, float]:
+    """Return the start or the one gain that explains most if changed, as text, and the fraction explained then."""
+    moved = refine_start(log, reference, controller, airframe, _SEARCHED)
+    best = recompute(log, moved, controller, airframe).explained
+    later = float(moved.time[0] - reference.time[0])
+    text = f"a start {abs(later):.3f} s {'later' if later > 0.0 else 'sooner'}"
     for name, members in _GROUPS[type(controller.gains)].items():
         if not getattr(controller.gains, members[0]) > 0.0:
             continue
@@ -193,14 +203,14 @@ def likely_gain(log: FlightLog, reference: Reference, controller: Controller, ai
 
         def lost(factor: float) -> float:
             found = recompute(log, reference, changed(float(np.exp(factor))), airframe)
-            return -(found.thrust + found.torque)
+            return -float(np.nansum([found.thrust, found.torque]))
 
         found = minimize_scalar(lost, bounds=tuple(np.log(_FACTORS)), method="bounded", options={"xatol": 0.01})
         likely = changed(float(np.exp(found.x)))
         explained = recompute(log, reference, likely, airframe).explained
         if explained > best:
             best, text = explained, f"{name} = {getattr(likely.gains, members[0]):.3g}"
-    return text, best if text else before
+    return text, best
 
 
 def body_rates(rows: NDArray) -> NDArray:
@@ -249,8 +259,8 @@ def _apart(log: FlightLog, reference: Reference) -> float:
 
 @njit(error_model="numpy")
 def _replay(
-    control: NDArray, time: NDArray, setpoints: NDArray, states: NDArray, gains: NDArray, memory: NDArray,
-    levers: NDArray, by_lee: bool,
+    control: NDArray, time: NDArray, setpoints: NDArray, mode: Modes, states: NDArray, gains: NDArray,
+    memory: NDArray, levers: NDArray, by_lee: bool,
 ) -> None:  # fmt: skip
     """Write the commands at every record, from the controller's `memory` at the first.
 
@@ -264,7 +274,7 @@ def _replay(
             step_lee(control[k], memory, gains, setpoints[k], states[k], period)
         else:
             vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoints[k]
-            asked = step_mellinger(vehicle, gains, ON_BOARD, states[k], period)
+            asked = step_mellinger(vehicle, gains, mode, states[k], period)
             control[k, 0], control[k, 1] = asked[0] / levers[2], 0.5 * levers[0] * asked[1] / levers[2]
             control[k, 2] = -0.5 * levers[0] * asked[2] / levers[2]
             control[k, 3] = -levers[1] * asked[3] / levers[2]

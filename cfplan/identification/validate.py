@@ -16,7 +16,8 @@ from cfplan.identification.flight_log import FlightLog, check_log
 from cfplan.identification.measured import Measured, measure, scale_by_voltage
 from cfplan.identification.reference import POSITION, SETPOINT_PERIOD, Reference
 from cfplan.identification.replay import Controller, Recomputed, check_explained, choose_jerk
-from cfplan.simulation.engine.estimated_loop import POSE_LATENCY, PoseStream, fly_with_estimator
+from cfplan.simulation.engine.estimated_loop import POSE_LATENCY, EstimatorInput, fly_with_estimator
+from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 WITHIN, CORRELATED = 0.20, 0.95  # of rms and largest; of the deviations
@@ -69,7 +70,11 @@ class Validation:
 
 
 def validate(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, poses: PoseStream | None = None
+    log: FlightLog,
+    reference: Reference,
+    controller: Controller,
+    airframe: Airframe,
+    poses: EstimatorInput | None = None,
 ) -> Validation:
     """Validate the model by a flight: its reference begun as flown, an airframe with the mass as weighed.
 
@@ -102,28 +107,30 @@ def without_pieces(airframe: Airframe) -> dict[str, tuple[Airframe, bool]]:
     }
 
 
-def poses_of(log: FlightLog, latency: float = POSE_LATENCY) -> PoseStream:
+def poses_of(log: FlightLog, latency: float = POSE_LATENCY) -> EstimatorInput:
     """Return the poses as logged; at 100 Hz without attitude, as of a single marker, where they are not."""
     if not len(log.pose_time):
-        return PoseStream(np.arange(_FIRST_POSE, log.duration, 0.01), latency, with_attitude=False)
-    return PoseStream(
+        return EstimatorInput(np.arange(_FIRST_POSE, log.duration, 0.01), latency, with_attitude=False)
+    return EstimatorInput(
         log.pose_time, latency, with_attitude=bool((np.linalg.norm(log.poses[:, 3:], axis=1) > 0.5).any())
     )
 
 
 def predict(
     log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, recomputed: Recomputed,
-    poses: PoseStream, *, estimator: bool = True,
+    poses: EstimatorInput, *, estimator: bool = True,
 ) -> NDArray:  # fmt: skip
     """Return where a vehicle of this airframe believes to be at each record, (N, 3) m."""
-    begins = np.arange(0.0, log.duration, SETPOINT_PERIOD)
-    # A setpoint holds for a period, so the reference stands for the middle of it.
-    setpoints = controller.setpoints(reference, begins + SETPOINT_PERIOD / 2)
-    scale = scale_by_voltage(log, airframe)
-    padded = np.append(scale, np.full(max(10 * len(setpoints) - len(scale), 0), scale[-1]))[: 10 * len(setpoints)]
+    mode = ON_BOARD
+    if len(reference.sent) and not controller.by_lee:
+        setpoints, times, mode = reference.sent, reference.sent_time, FULL_STATE
+    else:
+        times = np.arange(0.0, log.duration, SETPOINT_PERIOD)
+        # A setpoint holds for a period, so the reference stands for the middle of it.
+        setpoints = controller.setpoints(reference, times + SETPOINT_PERIOD / 2)
     flown = fly_with_estimator(
-        controller.gains, setpoints, airframe, log.state[0], poses,
-        memory=_memory(controller, recomputed, airframe, log), scale=padded, estimator=estimator,
+        controller.gains, setpoints, times, airframe, log.state[0], poses, scale=scale_by_voltage(log, airframe),
+        mode=mode, memory=_memory(controller, recomputed, airframe, log), estimator=estimator,
     )  # fmt: skip
     at = np.minimum(np.round(log.time * _RATE).astype(int), len(flown.beliefs) - 1)
     return flown.beliefs[at][:, POSITION]

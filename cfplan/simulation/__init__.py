@@ -2,6 +2,7 @@
 
 __all__ = [
     "dry_run",
+    "engine",
     "geometric_flight",
     "glitches",
     "lab",

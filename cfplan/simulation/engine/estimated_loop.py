@@ -38,20 +38,20 @@ from cfplan.vehicle.rotations import axes_of, matrix_of, yaw_of
 BELIEF_SIZE = 13
 POSE_LATENCY = 0.005  # s; public logs: 3 to 8 ms
 GYRO_CUTOFF, ACCELEROMETER_CUTOFF = 80.0, 30.0  # Hz, of the firmware's low-passes
-_SETPOINT_STEPS = 10  # ms that a setpoint holds
 _SETTLING = 4000  # ms of hover in which the filter's covariance settles
 _POSE_PERIOD = 10  # ms, while it settles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseStream:
-    """The poses that a vehicle was sent."""
+class EstimatorInput:
+    """The poses that a vehicle was sent, and the parameters of its filter."""
 
     time: NDArray  # (M,) s, when each arrived
     latency: float = POSE_LATENCY  # s
     with_attitude: bool = True  # a single marker gives none
     position_deviation: float = 0.001  # m, as the filter is told (locSrv.extPosStdDev)
     attitude_deviation: float = 0.05  # rad (locSrv.extQuatStdDev)
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s that the filter knows (kalman.dragB)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +69,9 @@ class _Loop(NamedTuple):
     states: NDArray
     beliefs: NDArray
     control: NDArray
-    setpoints: NDArray  # (K, 14 or 20) one per 10 ms, as the controller takes them
+    setpoints: NDArray  # (K, 14 or 20) as the controller takes them
+    changes: NDArray  # (K,) ms at which each comes into force
+    mode: mellinger.Modes  # (7,) of Mellinger's
     gains: NDArray
     vehicle: NDArray  # (77,) as in `layout`: body, memory of the controller, setpoint, airframe
     levers: NDArray  # (5,) arm m, yaw torque per thrust m, most thrust of a motor N, N per 16-bit unit, by Mellinger
@@ -84,21 +86,24 @@ class _Loop(NamedTuple):
 def fly_with_estimator(
     gains: LeeGains | MellingerGains,
     setpoints: NDArray,
+    times: NDArray,
     airframe: Airframe,
     start: NDArray,
-    poses: PoseStream,
+    poses: EstimatorInput,
     *,
+    scale: NDArray,
+    mode: mellinger.Modes = mellinger.ON_BOARD,
     memory: NDArray | None = None,
-    scale: NDArray | None = None,
     estimator: bool = True,
 ) -> EstimatedFlight:
-    """Fly setpoints, (K, 14 or 20) each for 10 ms as the controller of the gains takes them, from `start`, (13,).
+    """Fly setpoints, (K, 14 or 20) as the controller of the gains takes them, from `start`, (13,).
 
-    `memory` is the controller's at the start, `scale` the thrust scale at each of the 10 K milliseconds. Without the
-    estimator the controller knows the true state.
+    They come into force at `times`, (K,) s; the first holds before. `scale`, (N,), is the thrust scale at each
+    millisecond of the flight; `mode` is that of Mellinger's setpoints, `memory` the controller's at the start.
+    Without the estimator the controller knows the true state.
     """
     by_lee = isinstance(gains, LeeGains)
-    steps = len(setpoints) * _SETPOINT_STEPS
+    steps = len(scale)
     states, beliefs = np.zeros((steps, STATE_SIZE)), np.zeros((steps, BELIEF_SIZE))
     states[0, :BELIEF_SIZE] = beliefs[0] = start
     states[0, MOTORS] = airframe.hover_thrust
@@ -107,7 +112,7 @@ def fly_with_estimator(
         vehicle[MEMORY : MEMORY + len(memory)] = memory
     most = airframe.motor_thrust_max
     per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
-    prior = Prior().pack()
+    prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
     pose = np.array([
         round(poses.latency / TIME_STEP), poses.with_attitude, poses.position_deviation, poses.attitude_deviation
     ])  # fmt: skip
@@ -116,10 +121,12 @@ def fly_with_estimator(
         beliefs=beliefs,
         control=np.zeros((steps, 4)),
         setpoints=np.ascontiguousarray(setpoints, dtype=float),
+        changes=np.round(times / TIME_STEP).astype(np.int64),
+        mode=mode,
         gains=gains.pack(),
         vehicle=vehicle,
         levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
-        scale=np.full(steps, airframe.thrust_scale) if scale is None else np.asarray(scale, dtype=float),
+        scale=np.asarray(scale, dtype=float),
         arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
         pose=pose,
         kalman=_settled(start, pose, prior),
@@ -167,7 +174,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
     for _ in range(200):
         _filter(loop.lowpass[0], past[0], state[10:13], gyro)
         _filter(loop.lowpass[1], past[1], forces, acceleration)
-    row, arrived = np.zeros((1, 9)), 0
+    row, arrived, newest = np.zeros((1, 9)), 0, 0
     for step in range(len(loop.states)):
         loop.states[step] = state
         for axis in range(3):
@@ -185,8 +192,10 @@ def _run(loop: _Loop, estimator: bool) -> None:
             belief[:10] = state[:10]
         belief[10:13] = gyro
         loop.beliefs[step] = belief
+        while newest + 1 < len(loop.changes) and loop.changes[newest + 1] <= step:
+            newest += 1
         if step % 2 == 0:
-            _control(loop, loop.setpoints[step // _SETPOINT_STEPS], belief, control)
+            _control(loop, loop.setpoints[newest], belief, control)
         loop.control[step] = control
         vehicle[THRUST_SCALE] = loop.scale[step]
         vx, vy, vz = state[3], state[4], state[5]
@@ -207,7 +216,7 @@ def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) 
         lee.divide_power(control, (arm, twist), most, asked)
         return
     loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoint
-    units = mellinger.step_mellinger(loop.vehicle, loop.gains, mellinger.ON_BOARD, belief, 2 * TIME_STEP)
+    units = mellinger.step_mellinger(loop.vehicle, loop.gains, loop.mode, belief, 2 * TIME_STEP)
     control[0], control[1] = 4 * per_unit * units[0], 2 * arm * per_unit * units[1]
     control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # its signs are older
     commands = mellinger.mixed(units)

@@ -21,6 +21,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import Vector, axes_of
 
 REFERENCE_SIZE, MEMORY_SIZE = 14, 6
+_FIRMWARE_INERTIA = (16.571710e-6, 16.655602e-6, 29.261652e-6)  # kg m², which the controller assumes
 _LEAST_THRUST = 0.01  # N, below which the integrals are cleared
 _KP, _KD, _KI, _KR, _KW, _KA, _MASS, _INERTIA = 0, 3, 6, 9, 12, 15, 18, 19
 
@@ -48,15 +49,13 @@ class LeeGains:
     KI_y: float = 0.03
     KI_z: float = 0.03
     mass: float = 0.034  # kg
-    inertia: tuple[float, float, float] = (16.571710e-6, 16.655602e-6, 29.261652e-6)  # kg m², not a parameter
 
     def pack(self) -> NDArray:
         """Return the gains (22,), as the compiled controller takes them."""
-        *numbers, inertia = astuple(self)
-        return np.array([*numbers, *inertia])
+        return np.array([*astuple(self), *_FIRMWARE_INERTIA])
 
 
-LEE_GAINS = tuple(each.name for each in fields(LeeGains) if each.name != "inertia")
+LEE_GAINS = tuple(each.name for each in fields(LeeGains))
 
 
 @njit(allocates=False, error_model="numpy")

@@ -46,7 +46,7 @@ KALMAN = [f"kalman.{name}(f)" for name in ("stateX", "stateY", "stateZ", "q1", "
 MOCAP = [name.replace("stateEstimate", "locSrv") for name in ESTIMATE]
 
 
-def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.0, other=False):
+def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.0, other=False, times=TIMES):
     """The log of one kind of event, each followed by a record of a second kind, number 0, with one u16 if `other`."""
 
     def kind(number, name, variables):
@@ -56,12 +56,14 @@ def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.
     def stamp(time):
         return struct.pack("<Q", round(time * 1e6)) if version == 2 else struct.pack("<I", round(time * 1e3))
 
-    log = struct.pack("<BHH", 0xBC, version, 2) + kind(0xFFFF, name, variables) + kind(0, "estTDOA", ["id(H)"])
+    log = (
+        bytearray(struct.pack("<BHH", 0xBC, version, 2)) + kind(0xFFFF, name, variables) + kind(0, "estTDOA", ["id(H)"])
+    )
     codes = "<" + "".join(variable[-2] for variable in variables)
-    for time, row in zip(TIMES, rows, strict=True):
+    for time, row in zip(times, rows, strict=True):
         log += b"\xff\xff" + stamp(start + time) + struct.pack(codes, *row)
         log += b"\0\0" + stamp(start) + b"\1\0" if other else b""
-    return log + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
+    return bytes(log) + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
 
 
 def old_usd(variables, rows, *, block=8):
