@@ -13,7 +13,7 @@ from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog
 from cfplan.identification.reference import YAW, ReferenceMotion
 from cfplan.identification.replay import Controller
-from cfplan.simulation.dynamics.lee import LEE_GAINS, REFERENCE_SIZE, LeeGains
+from cfplan.simulation.engine.lee import LEE_GAINS, REFERENCE_SIZE, LeeGains
 from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS
 
 ARM, THRUST_TO_TORQUE = 0.046 / 2**0.5, 0.005964552  # m, as the power distribution of those firmwares has them

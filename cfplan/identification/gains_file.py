@@ -7,7 +7,7 @@ from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import read_plain
 from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.replay import Controller
-from cfplan.simulation.dynamics.lee import LEE_GAINS, LeeGains
+from cfplan.simulation.engine.lee import LEE_GAINS, LeeGains
 
 _MELLINGER_GAINS = tuple(each.name for each in fields(MellingerGains))
 

@@ -15,8 +15,8 @@ from cfplan.identification.replay import Controller, find_start
 from cfplan.identification.signals import FlightSignals, read_signals
 from cfplan.identification.validate import poses_of
 from cfplan.recording.record import Record, meant_motion
-from cfplan.simulation.dynamics.estimated_loop import EstimatorInput
-from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
+from cfplan.simulation.engine.estimated_loop import EstimatorInput
+from cfplan.simulation.engine.layout import SETPOINT_SIZE
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import yaw_of
 

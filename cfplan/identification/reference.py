@@ -11,7 +11,7 @@ from scipy.signal import savgol_filter
 
 from cfplan.errors import InputError
 from cfplan.geometry.polynomial_csv import read_polynomial_rows
-from cfplan.simulation.dynamics.lee import REFERENCE_SIZE
+from cfplan.simulation.engine.lee import REFERENCE_SIZE
 from cfplan.vehicle.trajectory import Trajectory
 
 SETPOINT_PERIOD = 0.010  # s, at which the vehicle's commander, or the stream, renews the setpoint

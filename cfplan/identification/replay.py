@@ -16,9 +16,10 @@ from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog
 from cfplan.identification.reference import POSITION, YAW, ReferenceMotion
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics import lee, mellinger
-from cfplan.simulation.dynamics.lee import LeeGains, step_lee
-from cfplan.simulation.dynamics.mellinger import FULL_STATE, ON_BOARD, SETPOINT_SIZE, step_controller
+from cfplan.simulation.engine import layout, lee
+from cfplan.simulation.engine.layout import MEMORY, SETPOINT, SETPOINT_SIZE, VEHICLE_SIZE
+from cfplan.simulation.engine.lee import LeeGains, step_lee
+from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD, Modes, step_mellinger
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 LEAST_EXPLAINED = 0.95  # fraction of the commands' variance
@@ -89,7 +90,7 @@ class Recomputed:
 def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Recomputed:
     """Return the commands that a controller gives for the logged state. Raises InputError where none were logged."""
     gains, setpoints = controller.gains.pack(), controller.setpoints(reference, log.time)
-    size = lee.MEMORY_SIZE if controller.by_lee else mellinger.MEMORY_SIZE
+    size = lee.MEMORY_SIZE if controller.by_lee else layout.MEMORY_SIZE
     levers = np.array([airframe.arm, airframe.thrust_to_torque, getattr(controller.gains, "mass_thrust", 0.0)])
     width = _SMOOTHING / float(np.median(log.gaps))
     logged, control = log.control, np.zeros((len(log.time), 4))
@@ -266,20 +267,22 @@ def _apart(log: FlightLog, reference: ReferenceMotion) -> float:
 
 @njit(error_model="numpy")
 def _replay(
-    control: NDArray, time: NDArray, setpoints: NDArray, mode: NDArray, states: NDArray, gains: NDArray,
+    control: NDArray, time: NDArray, setpoints: NDArray, mode: Modes, states: NDArray, gains: NDArray,
     memory: NDArray, levers: NDArray, by_lee: bool,
 ) -> None:  # fmt: skip
-    """Write the commands at every record; `memory` is changed.
+    """Write the commands at every record, from the controller's `memory` at the first.
 
     `levers`: arm m, yaw torque per thrust m, 16-bit units per N.
     """
-    asked = np.zeros(4)
+    vehicle = np.zeros(VEHICLE_SIZE)
+    vehicle[MEMORY : MEMORY + len(memory)] = memory
     for k in range(len(time)):
         period = time[k] - time[k - 1] if k > 0 else 0.002
         if by_lee:
             step_lee(control[k], memory, gains, setpoints[k], states[k], period)
         else:
-            step_controller(asked, memory, gains, setpoints[k], mode, states[k], period)
+            vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoints[k]
+            asked = step_mellinger(vehicle, gains, mode, states[k], period)
             control[k, 0], control[k, 1] = asked[0] / levers[2], 0.5 * levers[0] * asked[1] / levers[2]
             control[k, 2] = -0.5 * levers[0] * asked[2] / levers[2]
             control[k, 3] = -levers[1] * asked[3] / levers[2]

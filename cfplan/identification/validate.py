@@ -16,8 +16,8 @@ from cfplan.identification.flight_log import FlightLog, check_log
 from cfplan.identification.measured import Measured, measure, scale_by_voltage
 from cfplan.identification.reference import POSITION, SETPOINT_PERIOD, ReferenceMotion
 from cfplan.identification.replay import Controller, Recomputed, check_explained, choose_jerk
-from cfplan.simulation.dynamics.estimated_loop import POSE_LATENCY, EstimatorInput, fly_with_estimator
-from cfplan.simulation.dynamics.mellinger import FULL_STATE, ON_BOARD
+from cfplan.simulation.engine.estimated_loop import POSE_LATENCY, EstimatorInput, fly_with_estimator
+from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 WITHIN, CORRELATED = 0.20, 0.95  # of rms and largest; of the deviations

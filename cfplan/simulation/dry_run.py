@@ -14,16 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.simulation.dynamics.body import TIME_STEP, hovering
-from cfplan.simulation.dynamics.branching import MEMORY, THRUSTS
-from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
-from cfplan.simulation.dynamics.mellinger import FULL_COMMAND
+from cfplan.simulation.engine.body import TIME_STEP
+from cfplan.simulation.engine.flight import AS_PLANNED, ClosedLoop, Conditions, fly_setpoints
+from cfplan.simulation.engine.layout import hovering
+from cfplan.simulation.engine.mellinger import FULL_COMMAND
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.trajectory import Trajectory
@@ -32,7 +31,6 @@ SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
 SETTLED = 0.02  # m, nearer than this to the end it has arrived
 ARRIVED = 0.05  # m, and no farther than this may it be at last
 _STRIDE = 5  # ms between the moments at which places are compared
-NO_FLOOR = -np.inf  # a flight that sinks to the ground shows as a deviation
 _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
 
 
@@ -103,31 +101,19 @@ def dry_run(
     airframe: Airframe,
     limits: FlightLimits,
     *,
-    believed: Airframe | None = None,
-    delay: float = 0.0,
-    estimate: EstimateErrors = PERFECT,
+    conditions: Conditions = AS_PLANNED,
     snapshot: NDArray | None = None,
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
-    `believed` is the airframe for which the controller is tuned, the same where not given; `delay`, s, makes every
-    setpoint late; `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The
-    real-time factor counts everything but the compilation at the first call ever.
+    `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The real-time factor
+    counts everything but the compilation at the first call ever.
     """
     start = trajectory.at(0.0)
-    state = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot[:MEMORY]
+    begin = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot
     fly = partial(
-        fly_setpoints,
-        decode(encoded.payloads),
-        encoded.times,
-        airframe,
-        state,
-        gains=gains_for(believed or airframe),
-        floor=NO_FLOOR,
-        delay=delay,
-        estimate=estimate,
-        memory=None if snapshot is None else snapshot[MEMORY:THRUSTS],
-    )
+        fly_setpoints, decode(encoded.payloads), encoded.times, airframe, begin, conditions=conditions
+    )  # fmt: skip
     return fly_and_judge(
         fly, encoded.duration + SETTLING, lambda times: trajectory.at(times).position, trajectory.duration, limits
     )
@@ -150,16 +136,8 @@ def rehearse_setpoints(
 def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float = RATE) -> ClosedLoop:
     """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
     times = np.arange(len(payloads)) / rate
-    return fly_setpoints(
-        decode(payloads),
-        times,
-        airframe,
-        snapshot[:MEMORY],
-        duration=times[-1] + SETTLING,
-        gains=gains_for(airframe),
-        floor=NO_FLOOR,
-        memory=snapshot[MEMORY:THRUSTS],
-    )
+    duration = times[-1] + SETTLING
+    return fly_setpoints(decode(payloads), times, airframe, snapshot, duration)
 
 
 def fly_and_judge(

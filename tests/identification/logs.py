@@ -7,8 +7,8 @@ import numpy as np
 from cfplan.identification.flight_log import FlightLog
 from cfplan.identification.reference import ReferenceMotion
 from cfplan.identification.replay import Controller
-from cfplan.simulation.dynamics.estimated_loop import EstimatorInput, fly_with_estimator
-from cfplan.simulation.dynamics.lee import REFERENCE_SIZE, LeeGains
+from cfplan.simulation.engine.estimated_loop import EstimatorInput, fly_with_estimator
+from cfplan.simulation.engine.lee import REFERENCE_SIZE, LeeGains
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from cfplan.simulation.dynamics.body import QUATERNION, at_rest
-from cfplan.simulation.dynamics.lee import MEMORY_SIZE, REFERENCE_SIZE, LeeGains, divide_power, step_lee
+from cfplan.simulation.engine.layout import QUATERNION, at_rest
+from cfplan.simulation.engine.lee import MEMORY_SIZE, REFERENCE_SIZE, LeeGains, divide_power, step_lee
 from cfplan.vehicle.rotations import yaw_of
 
 ARM, THRUST_TO_TORQUE, THRUST_MAX = (

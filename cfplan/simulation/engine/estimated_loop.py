@@ -16,19 +16,22 @@ from scipy.signal import butter
 
 from cfplan.flight.firmware import MellingerGains
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics import lee, mellinger
-from cfplan.simulation.dynamics.body import (
-    FULL_EFFICIENCY,
+from cfplan.simulation.engine import lee, mellinger
+from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.kalman import Filter, Prior, estimate, new_filter, step_filter
+from cfplan.simulation.engine.layout import (
+    ASKED,
+    MEMORY,
+    MEMORY_SIZE,
     MOTORS,
+    SETPOINT,
+    SETPOINT_SIZE,
     STATE_SIZE,
-    STILL_AIR,
     THRUST_SCALE,
-    TIME_STEP,
-    pack_body,
-    step_body,
+    new_vehicle,
+    pack_airframe,
 )
-from cfplan.simulation.dynamics.kalman import Filter, Prior, estimate, new_filter, step_filter
-from cfplan.simulation.dynamics.lee import LeeGains
+from cfplan.simulation.engine.lee import LeeGains
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import axes_of, matrix_of, yaw_of
 
@@ -55,7 +58,7 @@ class EstimatorInput:
 class EstimatedFlight:
     """What a simulated vehicle did and believed, every millisecond."""
 
-    states: NDArray  # (N, 17) as in `body`
+    states: NDArray  # (N, 17) as in `layout`
     beliefs: NDArray  # (N, 13) estimated position, velocity, quaternion; body rate as measured
     control: NDArray  # (N, 4) thrust N and torques N m that the controller asked for
 
@@ -68,11 +71,10 @@ class _Loop(NamedTuple):
     control: NDArray
     setpoints: NDArray  # (K, 14 or 20) as the controller takes them
     changes: NDArray  # (K,) ms at which each comes into force
-    mode: NDArray  # (7,) of Mellinger's
+    mode: mellinger.Modes  # (7,) of Mellinger's
     gains: NDArray
-    memory: NDArray  # of the controller, changed in place
+    vehicle: NDArray  # (77,) as in `layout`: body, memory of the controller, setpoint, airframe
     levers: NDArray  # (5,) arm m, yaw torque per thrust m, most thrust of a motor N, N per 16-bit unit, by Mellinger
-    body: NDArray
     scale: NDArray  # (N,) the body's thrust scale, which falls with the battery
     arrivals: NDArray  # (M,) ms of each pose
     pose: NDArray  # (4,) latency ms, with attitude, standard deviations m and rad
@@ -90,7 +92,7 @@ def fly_with_estimator(
     poses: EstimatorInput,
     *,
     scale: NDArray,
-    mode: NDArray = mellinger.ON_BOARD,
+    mode: mellinger.Modes = mellinger.ON_BOARD,
     memory: NDArray | None = None,
     estimator: bool = True,
 ) -> EstimatedFlight:
@@ -105,7 +107,9 @@ def fly_with_estimator(
     states, beliefs = np.zeros((steps, STATE_SIZE)), np.zeros((steps, BELIEF_SIZE))
     states[0, :BELIEF_SIZE] = beliefs[0] = start
     states[0, MOTORS] = airframe.hover_thrust
-    size = lee.MEMORY_SIZE if by_lee else mellinger.MEMORY_SIZE
+    vehicle = new_vehicle(states[0], pack_airframe(airframe, floor=-np.inf))
+    if memory is not None:
+        vehicle[MEMORY : MEMORY + len(memory)] = memory
     most = airframe.motor_thrust_max
     per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
     prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
@@ -120,9 +124,8 @@ def fly_with_estimator(
         changes=np.round(times / TIME_STEP).astype(np.int64),
         mode=mode,
         gains=gains.pack(),
-        memory=np.zeros(size) if memory is None else memory.copy(),
+        vehicle=vehicle,
         levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
-        body=pack_body(airframe, floor=-np.inf),
         scale=np.asarray(scale, dtype=float),
         arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
         pose=pose,
@@ -163,8 +166,9 @@ def _settle(kalman: Filter, prior: NDArray, row: NDArray) -> None:
 
 @njit
 def _run(loop: _Loop, estimator: bool) -> None:
-    state, belief, control = loop.states[0].copy(), loop.beliefs[0].copy(), np.zeros(4)
-    motors, control_units = state[13:17] / loop.scale[0], np.zeros(4)
+    vehicle, belief, control = loop.vehicle, loop.beliefs[0].copy(), np.zeros(4)
+    state = vehicle[:STATE_SIZE]
+    vehicle[ASKED : ASKED + 4] = state[13:17] / loop.scale[0]
     rates, forces = np.zeros(3), np.array([0.0, 0.0, GRAVITY])  # as they are, and as they pass the low-passes
     gyro, acceleration, past = state[10:13].copy(), forces.copy(), np.zeros((2, 3, 2))
     for _ in range(200):
@@ -191,11 +195,11 @@ def _run(loop: _Loop, estimator: bool) -> None:
         while newest + 1 < len(loop.changes) and loop.changes[newest + 1] <= step:
             newest += 1
         if step % 2 == 0:
-            _control(loop, loop.setpoints[newest], belief, control, control_units, motors)
+            _control(loop, loop.setpoints[newest], belief, control)
         loop.control[step] = control
-        loop.body[THRUST_SCALE] = loop.scale[step]
+        vehicle[THRUST_SCALE] = loop.scale[step]
         vx, vy, vz = state[3], state[4], state[5]
-        step_body(state, motors, loop.body, STILL_AIR, FULL_EFFICIENCY)
+        step_body(vehicle, TIME_STEP)
         fx, fy, fz = (state[3] - vx) / TIME_STEP, (state[4] - vy) / TIME_STEP, (state[5] - vz) / TIME_STEP + GRAVITY
         axes = axes_of(state[6], state[7], state[8], state[9])
         for axis in range(3):
@@ -203,21 +207,21 @@ def _run(loop: _Loop, estimator: bool) -> None:
 
 
 @register_jitable
-def _control(
-    loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray, units: NDArray, motors: NDArray
-) -> None:
-    """Ask the controller: write thrust and torques, and the thrust of each motor."""
+def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) -> None:
+    """Ask the controller: write thrust and torques, and ask the motors."""
     arm, twist, most, per_unit, by_mellinger = loop.levers
+    asked = loop.vehicle[ASKED : ASKED + 4]
     if by_mellinger == 0.0:
-        lee.step_lee(control, loop.memory, loop.gains, setpoint, belief, 2 * TIME_STEP)
-        lee.divide_power(control, (arm, twist), most, motors)
+        lee.step_lee(control, loop.vehicle[MEMORY : MEMORY + MEMORY_SIZE], loop.gains, setpoint, belief, 2 * TIME_STEP)
+        lee.divide_power(control, (arm, twist), most, asked)
         return
-    mellinger.step_mellinger(units, loop.memory, loop.gains, setpoint, loop.mode, belief)
-    mellinger.distribute_power(units, motors)
+    loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoint
+    units = mellinger.step_mellinger(loop.vehicle, loop.gains, loop.mode, belief, 2 * TIME_STEP)
     control[0], control[1] = 4 * per_unit * units[0], 2 * arm * per_unit * units[1]
     control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # its signs are older
+    commands = mellinger.mixed(units)
     for motor in range(4):
-        motors[motor] *= per_unit
+        asked[motor] = commands[motor] * per_unit
 
 
 @register_jitable
