@@ -23,6 +23,10 @@ from typing import Any
 from cfplan.errors import InputError
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
+# platform_defaults_cf2.h and platform_defaults_cf21bl.h of firmware 2026.08: VMOTOR2THRUST0 to 3, THRUST_MAX.
+_CURVE_21_PLUS = (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145, 0.12)
+_CURVE_UPGRADE = (0.006728127583707208, 0.01011557616217668, 0.010263198062061085, 0.0028358638322392503, 0.18)
+_CURVE_BRUSHLESS = (-0.014058926705279723, 0.04265273261724981, 0.0018327760144017432, 0.0020576974784587178, 0.20)
 _ROTORPY_HOVER = (0.030 * GRAVITY / 4 / 2.3e-8) ** 0.5  # rad/s, from mass and k_eta
 
 AIRFRAMES = MappingProxyType(
@@ -53,6 +57,7 @@ AIRFRAMES = MappingProxyType(
                 drag=(0.01351483, 0.01677452),
                 source="drone-models 0.1.0 cf2x_P250, measured with markers; thrust cap of firmware 2026.08",
                 rotor_reaction=3.98e-4,
+                motor_curve=_CURVE_21_PLUS,
             ),
             Airframe(
                 name="crazyflie-thrust-upgrade",
@@ -66,6 +71,7 @@ AIRFRAMES = MappingProxyType(
                 drag=(0.01556697, 0.02191672),
                 source="drone-models 0.1.0 cf2x_T350, measured with markers; thrust cap of firmware 2026.08",
                 rotor_reaction=3.89e-4,
+                motor_curve=_CURVE_UPGRADE,
             ),
             Airframe(
                 name="crazyflie-2.1-brushless",
@@ -79,6 +85,7 @@ AIRFRAMES = MappingProxyType(
                 drag=(0.36 * 0.04338, 0.37 * 0.04338),
                 source="drone-models 0.1.0 cf21B_500; drag, inertia: public flights; thrust cap of firmware 2026.08",
                 rotor_reaction=2.98e-4,
+                motor_curve=_CURVE_BRUSHLESS,
             ),
         )
     }
