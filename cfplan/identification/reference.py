@@ -104,5 +104,5 @@ def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None
     rows[:, 9:12] = smooth(rows[:, 6:9], 1)
     if yaw is not None:
         rows[:, YAW] = np.interp(grid, time, np.unwrap(yaw))
-        rows[:, YAW + 1] = np.gradient(rows[:, YAW], grid)
+        rows[:, YAW + 1] = smooth(rows[:, YAW], 1)
     return ReferenceMotion("logged setpoints", grid, rows)

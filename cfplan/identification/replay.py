@@ -23,7 +23,8 @@ from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD, Modes, step
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 LEAST_EXPLAINED = 0.95  # fraction of the commands' variance
-_LEAST_VARIED = 0.01  # of the weight, N, and of the weight times the arm, N m: commands that vary less show nothing
+# Of the weight, N, and of the weight times the arm, N m: what varies less, as in hover, is mostly the log's rounding.
+_LEAST_VARIED = np.array([0.010, 0.015, 0.015, 0.015])
 _SMOOTHING = 0.008  # s, of both: records of state and command are not of the same control step
 _SEARCHED = 0.5  # s, half the range in which the start is searched for finely
 _COARSE, _FINE = 0.020, 0.001  # s
@@ -97,7 +98,8 @@ def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller
     mode = FULL_STATE if len(reference.sent) else ON_BOARD
     weight = controller.gains.mass * GRAVITY
     least = _LEAST_VARIED * weight * np.array([1.0, airframe.arm, airframe.arm, airframe.arm])
-    spread = np.maximum(np.std(gaussian_filter1d(logged, width, axis=0), axis=0), least)
+    counts = log.away_from_gaps(log.time)
+    spread = np.maximum(np.std(gaussian_filter1d(logged, width, axis=0)[counts], axis=0), least)
     known = np.isfinite(spread)
     if not known.any():
         hint = "log ctrlLee.thrustSI and .torquex to .torquez, or motor.m1 to .m4 with pm.vbat"
@@ -117,7 +119,7 @@ def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller
         slopes = np.column_stack([unexplained(memory[free] + each) - now for each in step]) / np.diag(step)
         memory[free] -= np.linalg.lstsq(slopes, now, rcond=_LEAST_KNOWN)[0]
     unexplained(memory[free])
-    left = np.var(gaussian_filter1d(control - logged, width, axis=0), axis=0)
+    left = np.var(gaussian_filter1d(control - logged, width, axis=0)[counts], axis=0)
     thrust, torque = 1.0 - left[0] / spread[0] ** 2, 1.0 - left[1:3].sum() / (spread[1:3] ** 2).sum()
     return Recomputed(control, memory, float(thrust), float(torque))
 
