@@ -7,7 +7,7 @@ STUDIES = {
     name.rpartition(".")[2].replace("_", "-"): f"studies.{name}"
     for name in (
         "dry_runs", "exports", "faults", "flights", "giving_way", "horizon", "identification", "lateness", "latency",
-        "link_loss", "physics", "planners", "random_faults", "steering", "stops", "waypoints",
+        "link_loss", "physics", "planners", "random_faults", "real_flights", "steering", "stops", "waypoints",
         "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
         "paper.simulators", "paper.yaw_consistency",
     )

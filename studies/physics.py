@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits import FlightLimits
 from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.engine.flight import Conditions
 from cfplan.simulation.other_bodies import BodyStep, fly_on, identified_body, rotorpy_body
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
@@ -105,7 +107,7 @@ def compared(
     """
     own_body = body.beside(airframe)
     times, theirs = fly_on(body.make(airframe), encoded, trajectory, airframe)
-    loop = dry_run(encoded, trajectory, own_body, limits, believed=airframe).loop
+    loop = dry_run(encoded, trajectory, own_body, limits, conditions=Conditions(gains_for(airframe))).loop
     own = loop.position[np.minimum(np.searchsorted(loop.time, times - 1e-9), len(loop.time) - 1)]
     wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
     return ComparedFlight(

@@ -6,17 +6,19 @@ import numpy as np
 
 from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, THRUST_MAX, hovering, pack_body, step_body
-from cfplan.simulation.dynamics.closed_loop import fly_setpoints
-from cfplan.simulation.dynamics.mellinger import (
-    FULL_COMMAND,
-    FULL_STATE,
-    MEMORY_SIZE,
+from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.flight import fly_setpoints
+from cfplan.simulation.engine.layout import (
+    ASKED,
+    MEMORY,
+    SETPOINT,
     SETPOINT_SIZE,
-    distribute_power,
-    level_out,
-    step_mellinger,
+    hovering,
+    new_vehicle,
+    pack_airframe,
+    setpoint_rows,
 )
+from cfplan.simulation.engine.mellinger import FULL_STATE, LEVEL_OUT, fly_mellinger
 from cfplan.vehicle.rotations import yaw_of
 
 
@@ -26,24 +28,22 @@ def fly_on(payloads, airframe, last: int, *, lag: float, level_after=540, off_af
     before = FullStateSetpoints(*(getattr(state, name)[: last + 1] for name in state.__slots__))
     start = hovering(airframe, state.position[0], float(yaw_of(state.quaternion[0])))
     flown = fly_setpoints(before, np.arange(last + 1) / 100.0, airframe, start, duration=last / 100.0)
-    now, thrusts, body = flown.states[-1].copy(), np.zeros(4), pack_body(airframe)
-    memory, gains, mode = np.zeros(MEMORY_SIZE), gains_for(airframe).pack(), FULL_STATE.copy()
-    setpoint = np.zeros(SETPOINT_SIZE)
-    fields = (state.position, state.velocity, state.acceleration, state.quaternion, state.body_rate)
-    setpoint[:16] = np.concatenate([field[last] for field in fields])
-    memory[6:10] = [now[10], -now[11], setpoint[13], -setpoint[14]]  # the integrals are small, the rates are not
-    control, motors, places = np.zeros(4), np.zeros(4), []
+    vehicle, mode = new_vehicle(flown.states[-1], pack_airframe(airframe)), FULL_STATE
+    gains = gains_for(airframe).pack()
+    setpoint = vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE]
+    setpoint[:] = setpoint_rows(state)[last]
+    # The integrals are small, the rates are not.
+    vehicle[MEMORY + 6 : MEMORY + 10] = vehicle[10], -vehicle[11], setpoint[13], -setpoint[14]
+    places = []
     for step in range(longest):
         if step == level_after:
-            level_out(setpoint, mode)
+            setpoint[15], mode = 0.0, LEVEL_OUT
         if step >= off_after:
-            thrusts[:] = 0.0
+            vehicle[ASKED : ASKED + 4] = 0.0
         elif step % 2 == 0:
-            step_mellinger(control, memory, gains, setpoint, mode, now)
-            distribute_power(control, motors)
-            thrusts[:] = motors * (body[THRUST_MAX] / FULL_COMMAND)
-        step_body(now, thrusts, body, STILL_AIR, FULL_EFFICIENCY)
-        places.append(now[:3].copy())
-        if step > off_after and now[2] <= 0.0:
+            fly_mellinger(vehicle, gains, mode)
+        step_body(vehicle, TIME_STEP)
+        places.append(vehicle[:3].copy())
+        if step > off_after and vehicle[2] <= 0.0:
             break
     return np.array(places)

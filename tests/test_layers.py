@@ -21,7 +21,7 @@ MODULES = "its other modules"
 ROOMS = {
     "planners": [MODULES, "solver", "expert", "baselines"],
     "flight": [MODULES, "setpoints", "on_board", "radio", "mocap", "pilot"],
-    "simulation": ["timed_fault", "dynamics", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
+    "simulation": ["timed_fault", "engine", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
     "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }
 

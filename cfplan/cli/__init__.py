@@ -22,6 +22,7 @@ from cfplan.cli.report import report
 from cfplan.cli.robustness import robustness
 from cfplan.cli.sim import sim
 from cfplan.cli.train import train
+from cfplan.cli.validate import validate
 from cfplan.cli.virtual import virtual
 from cfplan.errors import CfplanError
 from cfplan.version import __version__
@@ -74,8 +75,8 @@ def cfplan() -> None:
 
 
 COMMANDS = (
-    init, plan, check, export, sim, robustness, fly, virtual, replay, report, identify, mocap, dataset, train, bench,
-    doctor,
+    init, plan, check, export, sim, robustness, fly, virtual, replay, report, identify, validate, mocap, dataset, train,
+    bench, doctor,
 )  # fmt: skip
 for command in COMMANDS:
     cfplan.add_command(command)

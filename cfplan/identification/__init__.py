@@ -1,3 +1,16 @@
 """Identification: what flights say about the vehicle and its latencies, each figure with its uncertainty."""
 
-__all__ = ["advice", "airframe_yaml", "identify", "quantities"]
+__all__ = [
+    "advice",
+    "airframe_yaml",
+    "flight_log",
+    "gains_file",
+    "identify",
+    "logged_flight",
+    "measured",
+    "quantities",
+    "reference",
+    "replay",
+    "validate",
+    "validation_page",
+]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cfplan.files.whole import check_new_file, write_whole
 from cfplan.identification.quantities import Identification
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import Airframe, Spread
 
 _KEPT_DIGITS = 7
 _UNITS = {
@@ -19,6 +19,12 @@ _UNITS = {
     "motor_time_constant": "s",
     "drag": "N s/m, in the rotor plane and along the thrust axis",
     "rotor_reaction": "N m s/N",
+    "velocity_moment": "N m per m/s, about x by velocity along y, and about -y by velocity along x",
+    "thrust_scale": "thrust given in hover per thrust asked for",
+    "thrust_curvature": "1 less the slope of thrust over its scale, in hover",
+    "lift_with_speed": "1/(m/s)², gain of thrust",
+    "voltage_sag": "1/V, fraction of thrust lost; 0 with battery compensation",
+    "spread": "half the width of 95 %, as fractions of each value",
 }
 
 
@@ -31,6 +37,9 @@ def airframe_text(airframe: Airframe) -> str:
             text = json.dumps(value, ensure_ascii=False)
         elif isinstance(value, tuple):
             text = "[" + ", ".join(_number(part) for part in value) + "]"
+        elif isinstance(value, Spread):
+            parts = (f"{part.name}: {_number(getattr(value, part.name))}" for part in fields(Spread))
+            text = "{" + ", ".join(parts) + "}"
         else:
             text = _number(value)
         unit = f"  # {_UNITS[each.name]}" if each.name in _UNITS else ""

@@ -39,6 +39,7 @@ class FlightSignals:
     estimate: NDArray  # (K, 10) position, velocity, quaternion as the controller believes
     sent_time: NDArray  # (L,) s
     setpoint: NDArray  # (L, 9) position, velocity, acceleration
+    begin: float = 0.0  # s, of the record's clock, at which these times are 0
 
     @property
     def collective(self) -> NDArray:
@@ -80,6 +81,7 @@ def read_signals(record: Record) -> FlightSignals:
         estimate=np.hstack([estimates["position"], estimates["velocity"], estimates["quaternion"]]),
         sent_time=setpoints["time"] - begin,
         setpoint=np.hstack([setpoints["position"], setpoints["velocity"], setpoints["acceleration"]]),
+        begin=begin,
     )
 
 

@@ -33,7 +33,7 @@ from cfplan.learning.features import (
 from cfplan.machine_code import njit
 from cfplan.planners.solution import Status
 from cfplan.safety.limits import PlanLimits
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import airframe_of
 from cfplan.vehicle.profile import h_within, yaw_within
 
 MIN_SPEED_FACTOR = 0.97  # at which a label must be certified to be learned from
@@ -138,9 +138,8 @@ def _scaled(rows: pa.Table, folder: FilePath) -> tuple[ScaledLimits, ...]:
     columns = (rows[name].to_pylist() for name in ("row", "airframe", "limits"))
     for row, airframe, limits in zip(*columns, strict=True):
         try:
-            vehicle = Airframe(**airframe | {name: tuple(airframe[name]) for name in ("inertia", "drag")})
-            known = scaled_limits(vehicle, PlanLimits(**limits))
-        except (ValueError, TypeError, ArithmeticError) as error:
+            known = scaled_limits(airframe_of(airframe), PlanLimits(**limits))
+        except (KeyError, ValueError, TypeError, AttributeError, ArithmeticError) as error:
             raise _damaged(f"limits or vehicle of row {row}: {error}", folder) from None
         if not (np.isfinite(known.numbers).all() and np.isfinite(known.bounds).all() and (known.bounds > 0.0).all()):
             raise _damaged(f"limits or vehicle of row {row} are not those of a flight", folder)

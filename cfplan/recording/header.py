@@ -14,7 +14,7 @@ from cfplan.errors import InputError
 from cfplan.files.json_values import json_value, whole_characters
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import Box, Cylinder, Obstacle
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import Airframe, airframe_of
 from cfplan.version import __version__
 
 if TYPE_CHECKING:
@@ -159,7 +159,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             version=str(values["version"]),
             uri=str(values["uri"]),
             planner=str(values["planner"]),
-            vehicle=_airframe(values["vehicle"]),
+            vehicle=airframe_of(values["vehicle"]),
             thrust_at_full_command=_number(values["thrust_at_full_command"]),
             plan_limits=PlanLimits(
                 **{f.name: _limit(values["plan_limits"].get(f.name), f) for f in fields(PlanLimits)}
@@ -186,18 +186,6 @@ def _obstacle(values: Mapping[str, Any]) -> Obstacle:
         x, y, radius, low, high = (_number(values[key]) for key in ("x", "y", "radius", "low", "high"))
         return Cylinder(x, y, radius, low, high, name)
     return Box(_triple(values["low"]), _triple(values["high"]), _number(values["yaw"]), name)
-
-
-def _airframe(values: Mapping[str, Any]) -> Airframe:
-    given = [f for f in fields(Airframe) if f.type is float and (f.name in values or f.default is MISSING)]
-    numbers = {f.name: _number(values[f.name]) for f in given}
-    return Airframe(
-        name=str(values["name"]),
-        inertia=_triple(values["inertia"]),
-        drag=(_number(values["drag"][0]), _number(values["drag"][1])),
-        source=str(values["source"]),
-        **numbers,
-    )
 
 
 def _limit(value: float | None, limit: Field) -> float:

@@ -1,11 +1,11 @@
-"""Simulated flight: dynamics, the virtual Crazyflie and Vicon, the lab, the dry run and link loss."""
+"""Simulated flight: the simulator's engine, the virtual Crazyflie and Vicon, the lab, the dry run and link loss."""
 
 __all__ = [
     "dry_run",
+    "engine",
     "geometric_flight",
     "glitches",
     "lab",
-    "left_alone",
     "link_loss",
     "on_board_run",
     "other_bodies",

@@ -4,7 +4,6 @@ It starts in hover at the start, receives each payload when it is due and hovers
 the true state. Its motion is compared with the limits at which the pilot would brake.
 """
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -14,16 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
-from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.simulation.dynamics.body import TIME_STEP, hovering
-from cfplan.simulation.dynamics.branching import MEMORY, THRUSTS
-from cfplan.simulation.dynamics.closed_loop import PERFECT, ClosedLoop, EstimateErrors, fly_setpoints
-from cfplan.simulation.dynamics.mellinger import FULL_COMMAND
+from cfplan.simulation.engine.body import TIME_STEP
+from cfplan.simulation.engine.flight import AS_PLANNED, ClosedLoop, Conditions, fly_setpoints
+from cfplan.simulation.engine.layout import hovering
+from cfplan.simulation.engine.mellinger import FULL_COMMAND
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.trajectory import Trajectory
@@ -32,7 +29,6 @@ SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
 SETTLED = 0.02  # m, nearer than this to the end it has arrived
 ARRIVED = 0.05  # m, and no farther than this may it be at last
 _STRIDE = 5  # ms between the moments at which places are compared
-NO_FLOOR = -np.inf  # a flight that sinks to the ground shows as a deviation
 _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
 
 
@@ -103,31 +99,19 @@ def dry_run(
     airframe: Airframe,
     limits: FlightLimits,
     *,
-    believed: Airframe | None = None,
-    delay: float = 0.0,
-    estimate: EstimateErrors = PERFECT,
+    conditions: Conditions = AS_PLANNED,
     snapshot: NDArray | None = None,
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
-    `believed` is the airframe for which the controller is tuned, the same where not given; `delay`, s, makes every
-    setpoint late; `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The
-    real-time factor counts everything but the compilation at the first call ever.
+    `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The real-time factor
+    counts everything but the compilation at the first call ever.
     """
     start = trajectory.at(0.0)
-    state = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot[:MEMORY]
+    begin = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot
     fly = partial(
-        fly_setpoints,
-        decode(encoded.payloads),
-        encoded.times,
-        airframe,
-        state,
-        gains=gains_for(believed or airframe),
-        floor=NO_FLOOR,
-        delay=delay,
-        estimate=estimate,
-        memory=None if snapshot is None else snapshot[MEMORY:THRUSTS],
-    )
+        fly_setpoints, decode(encoded.payloads), encoded.times, airframe, begin, conditions=conditions
+    )  # fmt: skip
     return fly_and_judge(
         fly, encoded.duration + SETTLING, lambda times: trajectory.at(times).position, trajectory.duration, limits
     )
@@ -150,16 +134,8 @@ def rehearse_setpoints(
 def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float = RATE) -> ClosedLoop:
     """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
     times = np.arange(len(payloads)) / rate
-    return fly_setpoints(
-        decode(payloads),
-        times,
-        airframe,
-        snapshot[:MEMORY],
-        duration=times[-1] + SETTLING,
-        gains=gains_for(airframe),
-        floor=NO_FLOOR,
-        memory=snapshot[MEMORY:THRUSTS],
-    )
+    duration = times[-1] + SETTLING
+    return fly_setpoints(decode(payloads), times, airframe, snapshot, duration)
 
 
 def fly_and_judge(
@@ -170,7 +146,7 @@ def fly_and_judge(
     limits: FlightLimits,
 ) -> DryRun:
     """Call fly(duration=…), s; compare with where the vehicle is wanted at times (N,), (N, 3) m, for `moving`, s."""
-    fly(duration=0.0)  # compiles if need be, as does the next line
+    fly(duration=0.0)  # compiles if need be; the next line imports
     _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
     begun = time.perf_counter()
     loop = fly(duration=duration)
@@ -239,41 +215,15 @@ def _fault(run: Rehearsal, limits: FlightLimits) -> str:
 
 def _lasting(values: NDArray, patience: float) -> float:
     """Return the highest value below which the values do not fall for `patience`, s; less at the ends."""
+    from scipy.ndimage import minimum_filter1d  # slow to import
+
     window = min(max(1, round(patience / TIME_STEP)), len(values))
     values = np.where(np.isfinite(values), values, np.inf)
-    # Repeated ends stand for what is not simulated any more.
-    first, last = np.full(window // 2, values[0]), np.full(window - 1 - window // 2, values[-1])
-    lowest, covered = np.concatenate([first, values, last]), 1
-    while covered < window:  # the lowest of so many from each place on is that of two runs, which may overlap
-        more = min(covered, window - covered)
-        lowest, covered = np.minimum(lowest[:-more], lowest[more:]), covered + more
-    return float(lowest.max())
+    return float(minimum_filter1d(values, window, mode="nearest").max())  # ends stand for what is not simulated
 
 
-@njit(nogil=True)
 def _distances_to_path(positions: NDArray, wanted: NDArray) -> NDArray:
-    """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (N, 3) too, in order of time.
+    """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (M, 3)."""
+    from scipy.spatial import KDTree
 
-    The search goes from the same moment both ways. Where the distance exceeds the nearest one by some steps, it skips
-    as many: consecutive points are at most the longest step apart.
-    """
-    longest = 0.0
-    for n in range(len(wanted) - 1):
-        longest = max(longest, _distance(wanted[n], wanted[n + 1]))
-    out = np.empty(len(positions))
-    for n in range(len(positions)):
-        nearest = _distance(positions[n], wanted[n])
-        for direction in (-1, 1):
-            place = n + direction
-            while 0 <= place < len(wanted):
-                distance = _distance(positions[n], wanted[place])
-                nearest = min(nearest, distance)
-                skipped = (distance - nearest) / longest if longest > 0.0 else float(len(wanted))
-                place += direction * max(1, int(min(skipped, float(len(wanted)))))
-        out[n] = nearest
-    return out
-
-
-@njit
-def _distance(first: NDArray, second: NDArray) -> float:
-    return math.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)
+    return np.asarray(KDTree(wanted).query(positions)[0])

@@ -10,8 +10,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.simulation.dynamics.body import POSITION, TIME_STEP, VELOCITY, hovering
-from cfplan.simulation.dynamics.geometric import (
+from cfplan.simulation.engine.body import TIME_STEP
+from cfplan.simulation.engine.geometric import (
     CONTROL_STEPS,
     BodyStep,
     GeometricFlight,
@@ -19,6 +19,7 @@ from cfplan.simulation.dynamics.geometric import (
     follow_by,
     reference_rows,
 )
+from cfplan.simulation.engine.layout import POSITION, VELOCITY, hovering
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 

@@ -3,8 +3,7 @@
 By the firmware's own time-outs it holds the last setpoint, then levels out at that height, then stops its motors. While
 it levels out, the controller keeps the body rates of that last setpoint, which is why setpoints carry rates that brake
 (see flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is made the last one:
-the flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms, until the
-vehicle has settled in its level-out; from there on its attitude stands still, and only its place is followed.
+the flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms.
 
 The motors may also stop at once, because the pilot cuts them, or the supervisor locks. Then the vehicle falls with the
 speed that it has, which from 2 m/s and a height of 1.2 m is a metre on: where it brakes late before a wall, farther
@@ -19,11 +18,9 @@ vehicle comes near a wall.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,28 +30,26 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES, inside
-from cfplan.simulation.dynamics.body import pack_body
-from cfplan.simulation.dynamics.branching import SNAPSHOT_SIZE, arrival_steps, hovering_snapshot, setpoint_rows
-from cfplan.simulation.dynamics.mellinger import SETPOINT_SIZE
-from cfplan.simulation.left_alone import LIFT, fly_to_each, leave_alone, leave_alone_in_stops
+from cfplan.simulation.engine.layout import (
+    SETPOINT_SIZE,
+    SNAPSHOT_SIZE,
+    hovering_snapshot,
+    pack_airframe,
+    setpoint_rows,
+)
+from cfplan.simulation.engine.run import NEVER, Schedule, Vehicles, arrival_times, simulate
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
 OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
 _PARTS = 9  # boxes of a sweep, if there are obstacles
-_WORTH_THREADS = 400  # setpoints, of which each motor lag has a thread
-_Body = TypeVar("_Body")
-_Found = TypeVar("_Found")
-_STEP, _COARSE_STEP = 0.004, 0.008  # s, of the simulation after the last setpoint, and where it only looks for walls
+_STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; likewise where it only looks for walls
+_LONGEST = 4000  # ms that are simulated after the last setpoint, unless the vehicle lies on the floor before
 _NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
-_COARSE_EVERY = 2  # setpoints between those that are looked at coarsely
-_FORESEEN_EVERY = 16  # likewise, for an estimate
-ALLOWANCE = 0.1  # m, by which what is looked at coarsely may end farther out; 0.07 m at most in 36 flights, to 3 m/s
-_SLOW_EVERY, _SLOW_ALLOWANCE = (
-    8,
-    0.02,
-)  # both for motions at 0.9 m/s and 2 m/s²; m, of which 6 mm were seen in 240 motions
+ALLOWANCE = 0.1  # m, by which what had a first look alone may end farther out; 0.05 m at most in 51 flights, to 3 m/s
+_SLOW_ALLOWANCE = 0.07  # m, the same of slow motion; 0.068 m at most in 765 motions, far from the walls
+_FIRST_EVERY, _SLOW_EVERY, _FORESEEN_EVERY = 2, 8, 16  # setpoints between those that have a first look
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +81,7 @@ class LinkLossMoments:
     beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
     face: NDArray  # (N,) int, the number of that face of the space, or of the nearest one
     distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
-    snapshots: NDArray  # (L, N, 31) as in `branching`, at each setpoint, for each motor lag; (L, 0, 31) within stops
+    snapshots: NDArray  # (L, N, 31) at each setpoint, see `engine.layout`, for each motor lag; (L, 0, 31) within stops
 
     @property
     def worst(self) -> LinkLoss:
@@ -119,28 +114,10 @@ def link_loss_at_every_setpoint(
     The flight begins in hover, or from the snapshots `starts`, (L, 31), of another at the same setpoint.
     """
     state = decode(payloads)
-    snapshots = _snapshots(state, limits, rate, _begins(state, limits, starts))
-    return _lose_link(state, limits, rate, snapshots, np.ones(len(payloads), dtype=np.bool_))
-
-
-def link_loss_near_walls(
-    payloads: NDArray, limits: Limits, within: float, rate: float = RATE, starts: NDArray | None = None
-) -> LinkLossMoments:
-    """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst of all.
-
-    Of each other one it is only known how far it ends at most: one motor lag, coarse steps and every other setpoint
-    tell, with ALLOWANCE. Its box is as seen so. Arguments as for link_loss_at_every_setpoint, whose worst moment this
-    finds in a fraction of the time.
-    """
-    state = decode(payloads)
-    snapshots, seen = _flown_and_seen(state, limits, rate, starts)
-    forks = ~(seen.beyond + ALLOWANCE < -within)
-    forks[seen.beyond.argmax()] = True
-    found = _lose_link(state, limits, rate, snapshots, forks, seen)
-    others = ~forks & (found.beyond > found.beyond[forks].max())
-    if others.any():  # which may be worse
-        found = _lose_link(state, limits, rate, snapshots, forks | others, seen)
-    return found
+    rows = setpoint_rows(state)
+    snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
+    boxes = _swept(_Forks(rows, np.arange(len(rows)), snapshots, _airframes(limits)), limits)
+    return _judge(np.arange(len(rows)) / rate, state.position, boxes, limits, snapshots)
 
 
 def link_loss_at_walls(
@@ -148,125 +125,57 @@ def link_loss_at_walls(
 ) -> LinkLossMoments:
     """Lose the link after each setpoint that may leave the vehicle beyond a wall.
 
-    As link_loss_near_walls does, but of a flight that ends inside from everywhere it does not find the worst moment.
+    As link_loss_at_every_setpoint(), in a quarter of its time. What a first look says to end farther than ALLOWANCE
+    inside is taken to end that much farther out than it says; so of a flight that ends inside from everywhere this does
+    not find the worst moment.
     """
     state = decode(payloads)
-    snapshots, seen = _flown_and_seen(state, limits, rate, starts)
-    return _lose_link(state, limits, rate, snapshots, ~(seen.beyond + ALLOWANCE < 0.0), seen)
+    rows, airframes = setpoint_rows(state), _airframes(limits)
+    snapshots = _flown(rows, limits, airframes, rate, _begins(state, limits, starts))
+    seen = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
+    near = _look_again(seen, rows, snapshots, limits, ALLOWANCE)
+    found = _judge(np.arange(len(rows)) / rate, state.position, seen, limits, snapshots)
+    return replace(found, beyond=np.where(near, found.beyond, found.beyond + ALLOWANCE))
 
 
 def foreseen_link_loss(
     payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
 ) -> LinkLossMoments:
-    """Return about how each setpoint ends, were it the last one: an estimate, by one motor lag and coarse steps.
+    """Return about how each setpoint ends, were it the last one, by a first look at few of them."""
+    return _foreseen(payloads, limits, rate, starts, _FORESEEN_EVERY)
 
-    It takes a tenth of what link_loss_at_walls() takes.
+
+def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
+    """Lose the link at setpoints of take-off, of the way to the start or of landing, (N, 29) uint8 at `rate`, Hz.
+
+    A first look at every eighth one tells unless it ends near a wall.
     """
-    return _foreseen(decode(payloads), limits, rate, starts, _FORESEEN_EVERY)
+    found, state = _foreseen(payloads, limits, rate, None, _SLOW_EVERY), decode(payloads)
+    if found.worst.beyond < -_SLOW_ALLOWANCE:
+        return found
+    rows, boxes = setpoint_rows(state), found.boxes
+    snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, None))
+    _look_again(boxes, rows, snapshots, limits, _SLOW_ALLOWANCE)
+    return _judge(found.time, state.position, boxes, limits, snapshots)
 
 
-def _foreseen(
-    state: FullStateSetpoints, limits: Limits, rate: float, starts: NDArray | None, every: int
+def link_loss_within_stops(
+    stops: NDArray, starts: NDArray, limits: Limits, forks: NDArray, rate: float = RATE, *, coarsely: bool = False
 ) -> LinkLossMoments:
-    """Return about how each setpoint ends, looking at one in `every`."""
-    begins, bodies = _begins(state, limits, starts), _bodies(limits)
-    middle = len(bodies) // 2
-    return _look_coarsely(state, limits, rate, _flown(state, limits, rate, bodies[middle][0], begins[middle]), every)
+    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after those of their setpoints where `forks`, (K, M).
 
-
-def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> list[NDArray]:
-    """Return the snapshot that a flight begins from, for each motor lag."""
-    return [hovering_snapshot(limits.airframe, state)] * len(_lags(limits)) if starts is None else list(starts)
-
-
-def _snapshots(state: FullStateSetpoints, limits: Limits, rate: float, begins: list[NDArray]) -> NDArray:
-    """Return (L, N, 31) vehicle and controller at each setpoint, for each motor lag, where the link is not lost."""
-    bodies = [body for body, _ in _bodies(limits)]
-    return np.array(
-        _of_each_lag(lambda body, begin: _flown(state, limits, rate, body, begin), bodies, begins, len(state.position))
-    )
-
-
-def _flown(state: FullStateSetpoints, limits: Limits, rate: float, body: NDArray, begin: NDArray) -> NDArray:
-    """Return (N, 31) vehicle and controller at each setpoint, for one motor lag."""
-    rows = setpoint_rows(state)
-    snapshots = np.empty((len(rows), SNAPSHOT_SIZE))
-    fly_to_each(snapshots, rows, begin, _gains(limits), body, arrival_steps(len(rows), rate))
-    return snapshots
-
-
-def _lose_link(
-    state: FullStateSetpoints,
-    limits: Limits,
-    rate: float,
-    snapshots: NDArray,
-    forks: NDArray,
-    seen: LinkLossMoments | None = None,
-) -> LinkLossMoments:
-    """Lose the link after the setpoints where `forks`, (N,), says so; the others end as seen coarsely, or farther.
-
-    `snapshots`, (L, N, 31), are at each setpoint, for each motor lag.
-    """
-    time, wrong = np.arange(len(state.position)) / rate, _wrong(limits)
-    boxes = _boxes(state, limits, rate, snapshots, forks, wrong, None if seen is None else seen.boxes)
-    found = _judge(time, state.position, boxes, limits, snapshots)
-    near = forks & ~(found.beyond < -_NEAR)
-    if wrong[LIFT] and near.any():
-        sinking = _boxes(state, limits, rate, snapshots, near, wrong * (1.0, 1.0, -1.0, 1.0), boxes[0])
-        found = _judge(time, state.position, boxes + sinking, limits, snapshots)
-    return found if seen is None else replace(found, beyond=np.where(forks, found.beyond, found.beyond + ALLOWANCE))
-
-
-def _boxes(
-    state: FullStateSetpoints,
-    limits: Limits,
-    rate: float,
-    snapshots: NDArray,
-    forks: NDArray,
-    wrong: NDArray,
-    others: NDArray | None,
-) -> list[NDArray]:
-    """Return for each motor lag the boxes, (N, S, 2, 3), swept from where `forks` says so; `others` at the others."""
-    rows = setpoint_rows(state)[forks]
-
-    def one(body: tuple[NDArray, NDArray], begins: NDArray) -> NDArray:
-        swept = np.empty((len(rows), _parts(limits), 2, 3))
-        leave_alone(swept, begins[forks], rows, _gains(limits), body[1], *_steps(limits), wrong)
-        if others is None and len(rows) == len(forks):
-            return swept
-        boxes = np.empty((len(forks), *swept.shape[1:])) if others is None else others.copy()
-        boxes[forks] = swept
-        return boxes
-
-    return _of_each_lag(one, _bodies(limits), snapshots, len(rows))
-
-
-def _look_coarsely(
-    state: FullStateSetpoints, limits: Limits, rate: float, snapshots: NDArray, every: int = _COARSE_EVERY
-) -> LinkLossMoments:
-    """Return how each setpoint ends, by one motor lag, coarse steps and one in `every` setpoints.
-
-    `snapshots`, (N, 31), are at each setpoint, for the motor lag in the middle.
-    """
-    count = len(state.position)
-    rows = np.unique(np.append(np.arange(0, count, every), count - 1))
-    boxes = np.empty((len(rows), _parts(limits), 2, 3))
-    leave_alone(
-        boxes, snapshots[rows], setpoint_rows(state)[rows], _gains(limits), _coarse_bodies(limits),
-        *_steps(limits, _COARSE_STEP), _wrong(limits),
-    )  # fmt: skip
-    before = np.repeat(np.arange(len(rows)), np.diff(rows, append=count))
-    after = np.where(np.isin(np.arange(count), rows), before, np.minimum(before + 1, len(rows) - 1))
-    box, no_snapshots = _united([boxes[before], boxes[after]]), np.empty((0, count, SNAPSHOT_SIZE))
-    return _judge(np.arange(count) / rate, state.position, [box], limits, no_snapshots)
-
-
-def _flown_and_seen(
-    state: FullStateSetpoints, limits: Limits, rate: float, starts: NDArray | None
-) -> tuple[NDArray, LinkLossMoments]:
-    """Return the snapshots of a flight for each motor lag, and how each setpoint ends as seen coarsely."""
-    snapshots = _snapshots(state, limits, rate, _begins(state, limits, starts))
-    return snapshots, _look_coarsely(state, limits, rate, snapshots[len(snapshots) // 2])
+    Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
+    hold them. Returns a moment for each fork, one stop after another; times are from the first setpoint of the stop.
+    Coarsely, by a first look, what ends farther out than it seems does so by less than ALLOWANCE.
+    """  # six, and what it is about
+    rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
+    some = slice(_middle(limits), _middle(limits) + 1) if coarsely else slice(None)
+    airframes, step = _airframes(limits)[some], _FIRST_STEP if coarsely else _STEP
+    snapshots = _flown_each(rows, limits, airframes, rate, starts[some])[:, forks]
+    lost = _Forks(rows.reshape(-1, SETPOINT_SIZE), np.flatnonzero(forks), snapshots, airframes, step)
+    boxes = _swept(lost, limits)
+    times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
+    return _judge(times, places, boxes, limits, np.empty((len(starts), 0, SNAPSHOT_SIZE)))
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
@@ -279,58 +188,134 @@ def as_most_sluggish(snapshots: NDArray, limits: Limits) -> tuple[Airframe, NDAr
     return replace(limits.airframe, motor_time_constant=_lags(limits)[-1]), np.asarray(snapshots[-1])
 
 
-def link_loss_within_stops(
-    stops: NDArray, starts: NDArray, limits: Limits, forks: NDArray, rate: float = RATE, *, coarsely: bool = False
-) -> LinkLossMoments:
-    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after those of their setpoints where `forks`, (K, M).
+def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> NDArray:
+    """Return the snapshots, (L, 31), that a flight begins from with each motor lag."""
+    return np.stack([hovering_snapshot(limits.airframe, state)] * len(_lags(limits))) if starts is None else starts
 
-    Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
-    hold them. Returns a moment for each fork, one stop after another; times are from the first setpoint of the stop.
-    Coarsely, by one motor lag and coarse steps, what ends farther out than it seems does so by less than ALLOWANCE.
+
+def _flown(rows: NDArray, limits: Limits, airframes: NDArray, rate: float, begins: NDArray) -> NDArray:
+    """Return (L, N, 31): a flight of setpoints, (N, 20), from snapshots (L, 31), at each of them."""
+    return _flown_each(rows[None], limits, airframes, rate, begins[:, None])[:, 0]
+
+
+def _flown_each(rows: NDArray, limits: Limits, airframes: NDArray, rate: float, begins: NDArray) -> NDArray:
+    """Return (L, K, M, 31): K flights, (K, M, 20), from snapshots (L, K, 31), at each of their setpoints."""
+    flights, length = rows.shape[:2]
+    arrivals, first = arrival_times(length, rate), np.tile(rows.shape[1] * np.arange(flights), len(airframes))
+    batch = Vehicles(
+        begins.reshape(-1, SNAPSHOT_SIZE), np.repeat(airframes, flights, axis=0), first, first + length - 1,
+        np.zeros_like(first), np.zeros((len(first), 3)),
+    )  # fmt: skip
+    schedule = Schedule(
+        rows.reshape(-1, SETPOINT_SIZE), np.tile(arrivals, flights), gains_for(limits.airframe).pack(),
+        steps=int(arrivals[-1]) + 1,
+    )  # fmt: skip
+    return simulate(batch, schedule, arrived=length).arrived.reshape(len(airframes), flights, length, SNAPSHOT_SIZE)
+
+
+def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, every: int) -> LinkLossMoments:
+    """Return about how each setpoint ends, by a first look at one in `every`."""
+    state, middle = decode(payloads), _middle(limits)
+    rows, airframe = setpoint_rows(state), _airframes(limits)[middle : middle + 1]
+    snapshots = _flown(rows, limits, airframe, rate, _begins(state, limits, starts)[middle : middle + 1])
+    boxes = _first_look(rows, snapshots[0], limits, every)
+    return _judge(np.arange(len(rows)) / rate, state.position, boxes, limits, snapshots)
+
+
+def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
+    """Return boxes, (N, S, 2, 3), by one motor lag, coarse steps and one in `every` setpoints.
+
+    `snapshots`, (N, 31), are those of that lag. Between two setpoints the vehicle sweeps what it does at either.
     """
-    rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
-    arrivals, wrong, gains = arrival_steps(stops.shape[1], rate), _wrong(limits), _gains(limits)
-    steps = _steps(limits, _COARSE_STEP if coarsely else _STEP)
-
-    def one(body: tuple[NDArray, NDArray], begin: NDArray) -> NDArray:
-        boxes = np.empty((np.count_nonzero(forks), _parts(limits), 2, 3))
-        leave_alone_in_stops(boxes, rows, begin, forks, gains, *body, *steps, arrivals, wrong)
-        return boxes
-
-    begins = np.ascontiguousarray(starts)  # compiled for one layout
-    middle = len(begins) // 2
-    if coarsely:
-        boxes = [one((_bodies(limits)[middle][0], _coarse_bodies(limits)), begins[middle])]
-    else:
-        boxes = _of_each_lag(one, _bodies(limits), begins, len(stops))
-    times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
-    return _judge(times, places, boxes, limits, np.empty((len(boxes), 0, SNAPSHOT_SIZE)))
+    number, middle = np.arange(len(rows)), _middle(limits)
+    some = (number % every == 0) | (number == len(rows) - 1)
+    airframe = _airframes(limits)[middle : middle + 1]
+    boxes = _swept(_Forks(rows, number[some], snapshots[None, some], airframe, _FIRST_STEP), limits)
+    after = np.searchsorted(number[some], number)
+    return _united([boxes[np.where(some, after, after - 1)], boxes[after]])
 
 
-def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
-    """Lose the link at setpoints of take-off, of the way to the start or of landing, (N, 29) uint8 at `rate`, Hz.
+def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, allowance: float) -> NDArray:
+    """Replace the boxes, (N, S, 2, 3), that a first look says to end within `allowance`, m, of a wall; return these.
 
-    A coarse look at every eighth one tells unless one ends near a wall: then each is simulated with every motor lag.
+    `snapshots` are (L, N, 31).
     """
-    seen = _foreseen(decode(payloads), limits, rate, None, _SLOW_EVERY)
-    if seen.worst.beyond < -_SLOW_ALLOWANCE:
-        return seen
-    return link_loss_at_every_setpoint(payloads, limits, rate)
+    beyond, _ = limits.space.swept(boxes)
+    near: NDArray = ~(beyond + allowance < 0.0)
+    boxes[near] = _swept(_Forks(rows, np.flatnonzero(near), snapshots[:, near], _airframes(limits)), limits)
+    return near
 
 
-def _wrong(limits: Limits) -> NDArray:
-    """Return what the vehicle has wrong, (4,).
+class _Forks(NamedTuple):
+    """Where the link is lost, and how closely that is looked at."""
 
-    That is m/s² to a side, the damping of that motion by drag in 1/s, m/s² upwards, and m/s to a side.
-    """
-    wrong, drag = limits.link_loss, limits.airframe.drag[0]
-    push, damping = GRAVITY * math.tan(wrong.attitude_error), max(drag / limits.airframe.mass, 1e-6)
-    return np.array([push, damping, wrong.vertical_acceleration_error, wrong.velocity_error])
+    setpoints: NDArray  # (N, 20)
+    rows: NDArray  # (F,) int, the last setpoints
+    snapshots: NDArray  # (L, F, 31) when they arrive
+    airframes: NDArray  # (L, 26)
+    step: int = _STEP  # ms; a first look has _FIRST_STEP
 
 
-def _judge(time: NDArray, place: NDArray, boxes: list[NDArray], limits: Limits, snapshots: NDArray) -> LinkLossMoments:
-    """Return the worst of the boxes, (N, S, 2, 3) m, of each motor lag."""
-    swept = _united(boxes)
+def _swept(forks: _Forks, limits: Limits) -> NDArray:
+    """Return the boxes, (F, S, 2, 3) m, that all vehicles sweep from the forks."""
+    error = limits.link_loss.vertical_acceleration_error
+    swept = _united([_fall(forks, limits), _go_on(forks, limits, error)])
+    beyond, _ = limits.space.swept(swept)
+    near = ~(beyond < -_NEAR)
+    if error and forks.step == _STEP and near.any():
+        some = forks._replace(rows=forks.rows[near], snapshots=forks.snapshots[:, near])
+        swept[near] = _united([swept[near], _go_on(some, limits, -error)])
+    return swept
+
+
+def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
+    """Let vehicles fly on with their last setpoints; the accelerometer says `error`, m/s², too little."""
+    off, step = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER, forks.step
+    level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
+    return _leave(forks, limits, error, _alone(forks, limits)._replace(
+        level_after=level, off_after=off, spread=_drift(limits, off, step)
+    ))  # fmt: skip
+
+
+def _fall(forks: _Forks, limits: Limits) -> NDArray:
+    """Let the motors stop at once; a first look is at both extremes of motor lag, though the flight before was not."""
+    airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
+    snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
+    forks = forks._replace(snapshots=snapshots, airframes=airframes)
+    return _leave(forks, limits, 0.0, _alone(forks, limits)._replace(off_after=0))
+
+
+def _alone(forks: _Forks, limits: Limits) -> Schedule:
+    arrivals, gains = np.zeros(len(forks.setpoints), dtype=np.int64), gains_for(limits.airframe).pack()
+    step = forks.step
+    return Schedule(forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step)
+
+
+def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
+    """Return the boxes, (F, S, 2, 3) m, of all airframes together."""
+    lags, count = len(forks.airframes), len(forks.rows)
+    last = np.tile(forks.rows, lags)
+    batch = Vehicles(
+        forks.snapshots.reshape(-1, SNAPSHOT_SIZE), np.repeat(forks.airframes, count, axis=0), last, last,
+        np.full(len(last), NEVER), np.tile([0.0, 0.0, error], (len(last), 1)),
+    )  # fmt: skip
+    parts = _PARTS if limits.space.obstacles else 1
+    return _united(list(simulate(batch, schedule, parts=parts).boxes.reshape(lags, count, parts, 2, 3)))
+
+
+def _drift(limits: Limits, off: int, step: int) -> NDArray:
+    """Return how far errors of attitude and velocity may have carried the vehicle to a side after each step, m."""
+    wrong, airframe = limits.link_loss, limits.airframe
+    push, damping = GRAVITY * math.tan(wrong.attitude_error), max(airframe.drag[0] / airframe.mass, 1e-6)
+    time = 0.001 * step * np.arange(_LONGEST // step + 1)
+    powered, alone = np.minimum(time, 0.001 * off), np.maximum(time - 0.001 * off, 0.0)
+    speed = wrong.velocity_error * np.exp(-damping * powered) - push * np.expm1(-damping * powered) / damping
+    speed *= np.exp(-damping * alone)
+    return np.asarray(np.cumsum(0.5 * (speed[:-1] + speed[1:])) * 0.001 * step)
+
+
+def _judge(time: NDArray, place: NDArray, swept: NDArray, limits: Limits, snapshots: NDArray) -> LinkLossMoments:
+    """Return what sweeping boxes, (N, S, 2, 3) m, comes to."""
     beyond, face = limits.space.swept(swept)
     away = np.maximum(place - swept[:, :, 0].min(axis=1), swept[:, :, 1].max(axis=1) - place)[:, :2]
     return LinkLossMoments(time, place, swept, beyond, face, np.hypot(away[:, 0], away[:, 1]), snapshots)
@@ -342,59 +327,21 @@ def _united(boxes: list[NDArray]) -> NDArray:
     return np.stack([low, high], axis=2)
 
 
-def _parts(limits: Limits) -> int:
-    """Return how many boxes a sweep is cut into; one suffices for walls."""
-    return _PARTS if limits.space.obstacles else 1
-
-
-def _of_each_lag(
-    work: Callable[[_Body, NDArray], _Found], bodies: Sequence[_Body], begins: Iterable[NDArray], count: int
-) -> list[_Found]:
-    """Return what work gives for each motor lag; `count` is of the setpoints, or stops, that it looks at.
-
-    It is done side by side where that takes longer than threads take to begin.
-    """
-    if count < _WORTH_THREADS:
-        return [work(body, begin) for body, begin in zip(bodies, begins, strict=True)]
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(work, bodies, begins))
-
-
-def _bodies(limits: Limits) -> tuple[tuple[NDArray, NDArray], ...]:
-    """Return for each motor lag the parameters of the body for steps before the last setpoint, (P,), and after it.
-
-    The latter, (2, P), are of the vehicle that goes on alone, and of the one whose motors stop.
-    """
-    return _bodies_with(limits.airframe, tuple(_lags(limits)))
+def _airframes(limits: Limits) -> NDArray:
+    """Return (L, 26): the airframe with each motor lag."""
+    return _packed(limits.airframe, tuple(_lags(limits)))
 
 
 @lru_cache(maxsize=8)
-def _bodies_with(airframe: Airframe, lags: tuple[float, ...]) -> tuple[tuple[NDArray, NDArray], ...]:
-    airframes: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
-    return tuple((pack_body(each), np.stack([pack_body(each, step=_STEP)] * 2)) for each in airframes)
-
-
-def _coarse_bodies(limits: Limits) -> NDArray:
-    """Return (3, P): with the motor lag in the middle after the last setpoint, and falling with both extremes."""
-    lags = _lags(limits)
-    return _coarse_bodies_with(limits.airframe, (lags[len(lags) // 2], lags[0], lags[-1]))
-
-
-@lru_cache(maxsize=8)
-def _coarse_bodies_with(airframe: Airframe, lags: tuple[float, ...]) -> NDArray:
-    airframes: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
-    return np.stack([pack_body(each, step=_COARSE_STEP) for each in airframes])
+def _packed(airframe: Airframe, lags: tuple[float, ...]) -> NDArray:
+    each: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
+    return np.stack([pack_airframe(one) for one in each])
 
 
 def _lags(limits: Limits) -> list[float]:
     return sorted({*limits.link_loss.motor_lags, limits.airframe.motor_time_constant})
 
 
-def _gains(limits: Limits) -> NDArray:
-    return gains_for(limits.airframe).pack()
-
-
-def _steps(limits: Limits, step: float = _STEP) -> tuple[int, int]:
-    """Return after how many steps of a branch the vehicle levels out, and after how many its motors stop."""
-    off = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER
-    return round(LEVEL_AFTER / step), round(off / step)
+def _middle(limits: Limits) -> int:
+    """Return which of the motor lags has the first look."""
+    return len(_lags(limits)) // 2

@@ -9,14 +9,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import gains_for
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
 from cfplan.flight.on_board.pieces import RATE, Pieces, goals_at
 from cfplan.safety.limits import FlightLimits
-from cfplan.simulation.dry_run import NO_FLOOR, SETTLING, DryRun, fly_and_judge
-from cfplan.simulation.dynamics.body import hovering
-from cfplan.simulation.dynamics.closed_loop import fly_rows
-from cfplan.simulation.dynamics.mellinger import ON_BOARD, SETPOINT_SIZE
+from cfplan.simulation.dry_run import SETTLING, DryRun, fly_and_judge
+from cfplan.simulation.engine.flight import Conditions, fly_setpoints
+from cfplan.simulation.engine.layout import SETPOINT_SIZE, hovering
 from cfplan.vehicle.airframe import Airframe
 
 
@@ -27,7 +25,8 @@ def on_board_run(flight: OnBoardTrajectory, airframe: Airframe, limits: FlightLi
     rows = goal_rows(pieces, times)
     start = hovering(airframe, rows[0, :3], float(rows[0, 18]))
 
-    fly = partial(fly_rows, rows, ON_BOARD, times, airframe, start, gains=gains_for(airframe), floor=NO_FLOOR)
+    conditions = Conditions(on_board=True)
+    fly = partial(fly_setpoints, rows, times, airframe, start, conditions=conditions)
     duration = pieces.duration + SETTLING
     return fly_and_judge(fly, duration, lambda at: flight.reference.plan_at(at)[:, 0, :3], pieces.duration, limits)
 

@@ -1,6 +1,6 @@
 """Bodies that others have written, stepped as cfplan steps its own: RotorPy's, and those of drone-models.
 
-Each takes a state as in `dynamics/body.py`, (17,), and what each motor is asked for, (4,) N, and returns the
+Each takes a state as in `engine/layout.py`, (17,), and what each motor is asked for, (4,) N, and returns the
 state a while later. Both packages have rotor speeds where cfplan has thrusts; the curve of thrust over speed is known,
 so a thrust is as good as a speed.
 
@@ -22,25 +22,23 @@ from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.simulation.dry_run import SETTLING
-from cfplan.simulation.dynamics.body import (
+from cfplan.simulation.engine.body import TIME_STEP
+from cfplan.simulation.engine.layout import (
+    ASKED,
     BODY_RATE,
     MOTORS,
     POSITION,
     QUATERNION,
+    SETPOINT,
+    SETPOINT_SIZE,
     STATE_SIZE,
-    TIME_STEP,
     VELOCITY,
     hovering,
+    new_vehicle,
+    pack_airframe,
+    setpoint_rows,
 )
-from cfplan.simulation.dynamics.branching import STEPS_A_CONTROL, setpoint_rows
-from cfplan.simulation.dynamics.mellinger import (
-    CONTROL_PERIOD,
-    FULL_COMMAND,
-    FULL_STATE,
-    MEMORY_SIZE,
-    distribute_power,
-    step_mellinger,
-)
+from cfplan.simulation.engine.mellinger import CONTROL_PERIOD, FULL_STATE, fly_mellinger
 from cfplan.vehicle.airframe import MOTOR_TORQUE_SIGNS, Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -64,18 +62,18 @@ def fly_on(
 
     It hovers at first; the firmware's controller, with the gains for `airframe`, sees the true state.
     """
-    start = trajectory.at(0.0)
-    rows, state = setpoint_rows(decode(encoded.payloads)), hovering(airframe, start.position, float(start.yaw))
-    gains, memory, control, motors = gains_for(airframe).pack(), np.zeros(MEMORY_SIZE), np.zeros(4), np.zeros(4)
-    count = round((encoded.duration + SETTLING) / TIME_STEP) // STEPS_A_CONTROL + 1
+    start, rows = trajectory.at(0.0), setpoint_rows(decode(encoded.payloads))
+    vehicle = new_vehicle(hovering(airframe, start.position, float(start.yaw)), pack_airframe(airframe))
+    gains, steps = gains_for(airframe).pack(), round(CONTROL_PERIOD / TIME_STEP)
+    count = round((encoded.duration + SETTLING) / TIME_STEP) // steps + 1
     arrivals = np.round(encoded.times / TIME_STEP).astype(np.int64)
-    newest = np.maximum(np.searchsorted(arrivals, STEPS_A_CONTROL * np.arange(count), side="right") - 1, 0)
+    newest = np.maximum(np.searchsorted(arrivals, steps * np.arange(count), side="right") - 1, 0)
     positions = np.empty((count, 3))
     for n in range(count):
-        positions[n] = state[POSITION]
-        step_mellinger(control, memory, gains, rows[newest[n]], FULL_STATE, state)
-        distribute_power(control, motors)
-        state = step(state, motors * (airframe.motor_thrust_max / FULL_COMMAND), CONTROL_PERIOD)
+        positions[n] = vehicle[POSITION]
+        vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = rows[newest[n]]
+        fly_mellinger(vehicle, gains, FULL_STATE)
+        vehicle[:STATE_SIZE] = step(vehicle[:STATE_SIZE], vehicle[ASKED : ASKED + 4], CONTROL_PERIOD)
     return CONTROL_PERIOD * np.arange(count), positions
 
 

@@ -1,6 +1,9 @@
 """An airframe: mass, inertia, motors and motor mixing, drag."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +12,20 @@ GRAVITY = 9.81  # m/s², as the firmware has it
 
 # Motors 1 front right, 2 back right, 3 back left, 4 front left: the sign of each motor's torque about x, y, z.
 MOTOR_TORQUE_SIGNS = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]], dtype=float)
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """How far vehicles of one kind differ from its airframe: half the width of 95 %, as fractions of each value.
+
+    Of public flights of four vehicles, and of one vehicle from flight to flight.
+    """
+
+    mass: float = 0.02  # decks and markers
+    thrust_scale: float = 0.06
+    drag: float = 0.15
+    velocity_moment: float = 0.15
+    motor_time_constant: float = 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +44,17 @@ class Airframe:
     source: str
     rotor_reaction: float = 0.0
     """N m s/N, yaw torque per rate of change of thrust: a rotor's inertia over the slope of its thrust by its speed."""
+    velocity_moment: tuple[float, float] = (0.0, 0.0)
+    """N m per m/s, moment about x by velocity along y, and about -y by velocity along x, in body axes."""
+    thrust_scale: float = 1.0
+    """Thrust that the motors give in hover per thrust that the controller asks for."""
+    thrust_curvature: float = 0.0
+    """Fraction by which, about hover, thrust grows more slowly than in proportion to what is asked for."""
+    lift_with_speed: float = 0.0
+    """1/(m/s)², gain of thrust at equal rotor speed per squared speed in the rotor plane."""
+    voltage_sag: float = 0.0
+    """1/V, fraction of thrust lost per volt of battery; 0 where the firmware compensates it."""
+    spread: Spread = Spread()
 
     @property
     def hover_thrust(self) -> float:
@@ -43,3 +71,30 @@ class Airframe:
         """Return (4, 4): [collective thrust, torque x, y, z] = mixing @ motor thrusts."""
         levers = np.array([self.arm, self.arm, self.thrust_to_torque])
         return np.vstack([np.ones(4), levers[:, None] * MOTOR_TORQUE_SIGNS])
+
+
+def airframe_of(values: Mapping[str, Any]) -> Airframe:
+    """Return the airframe of plain data as `asdict` makes it; null is NaN.
+
+    Fields of later versions are ignored, those that earlier ones lacked keep their defaults. Raises KeyError,
+    TypeError, ValueError or AttributeError where the data are those of no airframe.
+    """
+    given: dict[str, Any] = {}
+    for each in fields(Airframe):
+        if each.name not in values and each.default is not MISSING:
+            continue
+        value = values[each.name]
+        if each.type is str:
+            given[each.name] = str(value)
+        elif each.type is float:
+            given[each.name] = _number(value)
+        elif each.type is Spread:
+            named = {part.name for part in fields(Spread)} & set(value.keys())
+            given[each.name] = Spread(**{name: _number(value[name]) for name in named})
+        else:
+            given[each.name] = tuple(_number(part) for part, _ in zip(value, get_args(each.type), strict=True))
+    return Airframe(**given)
+
+
+def _number(value: float | None) -> float:
+    return math.nan if value is None else float(value)

@@ -7,11 +7,24 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import read_yaml_with_places
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import Airframe, Spread, airframe_of
 
 # Bounds far beyond what flies indoors: beyond them digits would be lost, or a unit is wrong.
 Inertia = Annotated[float, Field(ge=1e-8, le=1.0)]
+Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Moment = Annotated[float, Field(ge=0.0, le=0.1)]
+_USUAL = Spread()
 Drag = Annotated[float, Field(ge=0.0, le=10.0)]
+
+
+class _SpreadFile(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    mass: Fraction = _USUAL.mass
+    thrust_scale: Fraction = _USUAL.thrust_scale
+    drag: Fraction = _USUAL.drag
+    velocity_moment: Fraction = _USUAL.velocity_moment
+    motor_time_constant: Fraction = _USUAL.motor_time_constant
 
 
 class _AirframeFile(BaseModel):
@@ -28,6 +41,12 @@ class _AirframeFile(BaseModel):
     drag: tuple[Drag, Drag]
     source: Annotated[str, Field(min_length=1, max_length=1000)]
     rotor_reaction: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    velocity_moment: tuple[Moment, Moment] = (0.0, 0.0)
+    thrust_scale: Annotated[float, Field(ge=0.2, le=5.0)] = 1.0
+    thrust_curvature: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.0
+    lift_with_speed: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
+    voltage_sag: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    spread: _SpreadFile = _SpreadFile()
 
 
 def read_airframe(file: Path | str) -> Airframe:
@@ -37,7 +56,7 @@ def read_airframe(file: Path | str) -> Airframe:
         InputError: with `file:line:column`, also for one that cannot hover.
     """
     content, places = read_yaml_with_places(file, _AirframeFile)
-    airframe = Airframe(**content.model_dump())
+    airframe = airframe_of(content.model_dump())
     if not airframe.motor_thrust_min < airframe.hover_thrust < airframe.motor_thrust_max:
         raise InputError(
             f"it cannot hover: each motor needs {airframe.hover_thrust:.3g} N and gives "

@@ -4,17 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from one_body import stepped
 
 from cfplan.errors import InputError
 from cfplan.identification.advice import deviation_per_speed, suggests_identification
 from cfplan.identification.airframe_yaml import airframe_text, safety_lines, write_airframe
 from cfplan.identification.identify import identify
 from cfplan.recording.record import Record
-from cfplan.simulation.dynamics.body import hovering, pack_body, step_body
+from cfplan.simulation.engine.body import TIME_STEP
+from cfplan.simulation.engine.layout import hovering, pack_airframe
 from cfplan.vehicle.airframe_file import read_airframe
 from cfplan.vehicle.airframes import AIRFRAMES
-
-STILL_AIR, FULL = np.zeros(3), np.ones(4)
 
 
 @pytest.fixture(scope="module")
@@ -90,8 +90,10 @@ def test_motion_is_the_same_if_mass_thrust_drag_and_inertia_all_grow():
     chance = np.random.default_rng(1)
     for _ in range(300):
         shares = 0.5 + 0.2 * chance.normal(size=4)
-        for state, each in zip(states, (airframe, scaled), strict=True):
-            step_body(state, shares * each.motor_thrust_max, pack_body(each, floor=-np.inf), STILL_AIR, FULL)
+        states = [
+            stepped(state, shares * each.motor_thrust_max, pack_airframe(each, floor=-np.inf), TIME_STEP)
+            for state, each in zip(states, (airframe, scaled), strict=True)
+        ]
     assert np.linalg.norm(states[0][:3]) > 0.01
     np.testing.assert_allclose(states[0][:13], states[1][:13], atol=1e-9)
 

@@ -20,8 +20,8 @@ from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Phase, PhaseEntered
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.dynamics.body import hovering
-from cfplan.simulation.dynamics.closed_loop import fly_setpoints
+from cfplan.simulation.engine.flight import Conditions, fly_setpoints
+from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -154,8 +154,7 @@ def test_gains_that_may_fly_fly_what_the_dry_run_flew():
             LIMITS.airframe,
             hovering(LIMITS.airframe, state.position, float(state.yaw)),
             duration=trajectory.duration,
-            gains=gains,
-            floor=-1e9,
+            conditions=Conditions(gains),
         )
         return np.linalg.norm(loop.position - trajectory.at(loop.time).position, axis=1).max()
 

@@ -8,12 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits
 from cfplan.simulation.dry_run import SETTLING, dry_run
-from cfplan.simulation.dynamics.closed_loop import EstimateErrors
+from cfplan.simulation.engine.flight import Conditions, EstimateErrors
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
@@ -149,7 +150,13 @@ def test_a_vehicle_that_cannot_carry_itself_fails():
 
 
 def test_numbers_that_are_none_fail_it(encoded, trajectory):
-    run = dry_run(encoded, trajectory, replace(AIRFRAME, drag=(np.nan, np.nan)), LIMITS, believed=AIRFRAME)
+    run = dry_run(
+        encoded,
+        trajectory,
+        replace(AIRFRAME, drag=(np.nan, np.nan)),
+        LIMITS,
+        conditions=Conditions(gains_for(AIRFRAME)),
+    )
     assert not run.passed
     assert run.deviation == np.inf
     assert run.path_distance == np.inf
@@ -159,8 +166,8 @@ def test_numbers_that_are_none_fail_it(encoded, trajectory):
 @pytest.mark.parametrize(
     ("other", "told"),
     [
-        pytest.param({"mass": 1.05}, {"believed": AIRFRAME}, id="heavier"),
-        pytest.param({"mass": 0.95}, {"believed": AIRFRAME}, id="lighter"),
+        pytest.param({"mass": 1.05}, {"gains": gains_for(AIRFRAME)}, id="heavier"),
+        pytest.param({"mass": 0.95}, {"gains": gains_for(AIRFRAME)}, id="lighter"),
         pytest.param({"motor_time_constant": 1.25}, {}, id="slow motors"),
         pytest.param({}, {"delay": 0.020}, id="setpoints late"),
         pytest.param({}, {"estimate": EstimateErrors(0.010, 0.002, 0.03)}, id="estimate late and noisy"),
@@ -168,7 +175,7 @@ def test_numbers_that_are_none_fail_it(encoded, trajectory):
 )
 def test_the_same_bytes_fly_a_vehicle_a_little_different_otherwise(good, encoded, trajectory, other, told):
     airframe = replace(AIRFRAME, **{name: factor * getattr(AIRFRAME, name) for name, factor in other.items()})
-    run = dry_run(encoded, trajectory, airframe, LIMITS, **told)
+    run = dry_run(encoded, trajectory, airframe, LIMITS, conditions=Conditions(**told))
     assert run.passed
     assert run.deviation != good.deviation
     if other.get("mass", 1.0) > 1.0:

@@ -10,8 +10,8 @@ import pytest
 from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.dynamics.body import hovering
-from cfplan.simulation.dynamics.closed_loop import fly_setpoints
+from cfplan.simulation.engine.flight import fly_setpoints
+from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.glitches import (
     AFTERWARDS,
     GAP,
@@ -21,7 +21,6 @@ from cfplan.simulation.glitches import (
     WITHOUT_POSES_EVERY,
     glitch_at_every_setpoint,
     glitch_at_sampled_setpoints,
-    glitch_where_nearly_lost,
 )
 
 REPOSITORY = Path(__file__).parents[2]
@@ -48,7 +47,7 @@ def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap
     held = np.where((rows > number) & (rows < number + round(100 * GAP)), number, rows)
     start = hovering(limits.airframe, decode(line).position[0])
     end = number / 100 + GAP + AFTERWARDS
-    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, duration=end, floor=-np.inf)
+    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, end)
     since = np.arange(10 * number, round(1000 * end))
     due = decode(line).position[np.minimum(since // 10, len(line) - 1)]
     off = np.linalg.norm(flown.position[since] - due, axis=1).max()
@@ -62,7 +61,13 @@ def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limit
     start = hovering(limits.airframe, decode(line).position[0])
     seconds = GAP + AFTERWARDS
     end = len(line) / 100 + seconds
-    flown = fly_setpoints(decode(line), np.arange(len(line)) / 100, limits.airframe, start, duration=end, floor=-np.inf)
+    flown = fly_setpoints(
+        decode(line),
+        np.arange(len(line)) / 100,
+        limits.airframe,
+        start,
+        duration=end,
+    )
     since = np.arange(round(1000 * end))
     off = np.linalg.norm(
         flown.position[since + 1] - decode(line).position[np.minimum(since // 10, len(line) - 1)], axis=1
@@ -112,11 +117,7 @@ def test_sampled_gaps_say_the_same_where_the_vehicle_is_nearly_lost_and_little_l
     assert np.all(sampled.deviation > found.deviation - 0.1 * limits.flight.deviation.cut)
     cut = found.deviation.max() / 0.9  # then some are nearly lost
     strict = replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=cut)))
-    for sampled in (glitch_at_sampled_setpoints(line, strict), glitch_where_nearly_lost(line, strict)):
-        _same_where_nearly_lost(sampled, found, cut, line)
-
-
-def _same_where_nearly_lost(sampled, found, cut, line):
+    sampled = glitch_at_sampled_setpoints(line, strict)
     nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > NEARLY + 0.15).any(axis=0)
     assert 0 < np.count_nonzero(nearly) < len(line)
     np.testing.assert_array_equal(sampled.deviation[:, nearly], found.deviation[:, nearly])

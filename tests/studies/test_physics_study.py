@@ -5,20 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from one_body import stepped
 
 from cfplan.errors import InputError
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.dry_run import NO_FLOOR, dry_run
-from cfplan.simulation.dynamics.body import (
-    FULL_EFFICIENCY,
-    STILL_AIR,
-    TIME_STEP,
-    hovering,
-    pack_body,
-    step_body,
-)
+from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.engine.flight import NO_FLOOR
+from cfplan.simulation.engine.layout import hovering, pack_airframe
 from cfplan.simulation.other_bodies import fly_on, identified_body, rotorpy_body
 from cfplan.vehicle.airframes import AIRFRAMES
 from studies.physics import BODIES, PAPER_LAG, REALISTIC_LAG, STUDY, OtherBody, Settings, measure
@@ -42,10 +37,7 @@ def result(path_file):
 
 
 def own_step(state, asked, seconds):
-    state, body = state.copy(), pack_body(AIRFRAME, floor=NO_FLOOR)
-    for _ in range(round(seconds / TIME_STEP)):
-        step_body(state, np.asarray(asked), body, STILL_AIR, FULL_EFFICIENCY)
-    return state
+    return stepped(state, asked, pack_airframe(AIRFRAME, floor=NO_FLOOR), seconds)
 
 
 def test_with_the_dry_runs_body_it_is_the_dry_runs_flight(path_file):

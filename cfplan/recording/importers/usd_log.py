@@ -32,6 +32,7 @@ _PLACE: Columns = {axis: (axis, 1.0) for axis in PLACE}
 _MILLIMETRES: Columns = {axis: (axis, 1e-3) for axis in PLACE}
 _DEGREE = math.pi / 180
 _ANGLES: Columns = {"roll": ("roll", _DEGREE), "pitch": ("pitch", -_DEGREE), "yaw": ("yaw", _DEGREE)}  # pitch: nose up
+_ROLL_PITCH_YAW = ("roll", "pitch", "yaw")  # of ctrlLee: rad, right-handed
 _KALMAN = ("stateX", "stateY", "stateZ", "q1", "q2", "q3", "q0")
 
 
@@ -42,11 +43,17 @@ def _of_group(group: str, columns: Columns) -> Columns:
 SOURCES = {  # subject: the variables of its pose
     "mocap": _of_group("locSrv", POSE),
     "estimate": _of_group("stateEstimate", {**POSE, **_ANGLES}),
-    "estimate, compressed": _of_group("stateEstimateZ", {**_MILLIMETRES, "quat": ("quat", 1.0)}),
+    "estimate, compressed": {
+        **_of_group("stateEstimateZ", {**_MILLIMETRES, "quat": ("quat", 1.0)}),
+        **{angle: (f"ctrlLee.rpy{axis}", 1.0) for angle, axis in zip(_ROLL_PITCH_YAW, PLACE, strict=True)},
+    },
     "kalman": {channel: (f"kalman.{name}", 1.0) for channel, name in zip(POSE, _KALMAN, strict=True)},
     "lighthouse": _of_group("lighthouse", _PLACE),
     "setpoint": _of_group("ctrltarget", _PLACE),  # its yaw is a rate
-    "setpoint, compressed": _of_group("ctrltargetZ", _MILLIMETRES),
+    "setpoint, compressed": {
+        **_of_group("ctrltargetZ", _MILLIMETRES),
+        **{angle: (f"ctrlLee.rpyd{axis}", 1.0) for angle, axis in zip(_ROLL_PITCH_YAW, PLACE, strict=True)},
+    },
 }
 
 
@@ -56,32 +63,42 @@ def read(file: Path) -> MocapLog:
     A log without its checksum was cut off: all complete records are read, and `truncated` is True.
     Raises InputError if the checksum is wrong, the head is damaged, or no variables of a pose were logged.
     """
-    data = file.read_bytes()
-    unit, tables, truncated = _events(data, file) if data[0] == _MAGIC else _blocks(data, file)
-    starts = [float(rows["t"][0]) for _, rows in tables if len(rows)]
-    if not starts:
-        hint = "nothing was logged, or copy it again"
-        raise InputError("the log ends before its first record", where=str(file), hint=hint)
+    tables, truncated = read_tables(file)
     notes = []
     if truncated:
         notes.append("the log ends without its checksum, as when the vehicle loses power; all before that is shown")
     subjects = []
-    for event, rows in tables:
-        table = {name: rows[name] for name in rows.dtype.names or ()}
+    for event, table in tables:
         logged = {name: c for name, c in SOURCES.items() if all(c[axis][0] in table for axis in PLACE)}
         if logged:
-            table["t"] = (rows["t"].astype(float) - min(starts)) * unit
             ordered = in_order(table, f"records of {event!r}", notes)
             at = "" if event == "fixedFrequency" else f" at {event}"
             subjects += [subject(name + at, ordered, columns) for name, columns in logged.items()]
     if not subjects:
-        names = [f"{event} has {', '.join((rows.dtype.names or ())[1:21]) or 'none'}" for event, rows in tables]
+        names = [f"{event} has {', '.join([*table][1:21]) or 'none'}" for event, table in tables]
         raise InputError(
             f"no position of a group is among the variables: {'; '.join(names[:6])}",
             where=str(file),
             hint="log stateEstimate.x, .y, .z and .qx, .qy, .qz, .qw, named in the card's config.txt",
         )
     return MocapLog(FORMAT, tuple(subjects), tuple(notes), truncated)
+
+
+def read_tables(file: Path) -> tuple[list[tuple[str, dict[str, NDArray]]], bool]:
+    """Return each event with its columns by variable, "t" in s since the first record, and whether the log was cut off.
+
+    Raises InputError as `read` does.
+    """
+    data = file.read_bytes()
+    unit, tables, truncated = _events(data, file) if data[0] == _MAGIC else _blocks(data, file)
+    starts = [float(rows["t"][0]) for _, rows in tables if len(rows)]
+    if not starts:
+        hint = "nothing was logged, or copy it again"
+        raise InputError("the log ends before its first record", where=str(file), hint=hint)
+    found = [(event, {name: rows[name] for name in rows.dtype.names or ()}) for event, rows in tables]
+    for _, table in found:
+        table["t"] = (table["t"].astype(float) - min(starts)) * unit
+    return found, truncated
 
 
 def _events(data: bytes, file: Path) -> tuple[float, list[tuple[str, NDArray]], bool]:

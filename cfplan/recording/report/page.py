@@ -45,12 +45,17 @@ def page(flights: Sequence[ReportedFlight]) -> str:
         parts.append(_comparison(flights))
     parts += [_flight(flight) for flight in flights]
     versions = sorted({flight.record.header.version for flight in flights})
+    return html_page(f"{title}: flight report", "".join(parts), ", ".join(versions))
+
+
+def html_page(title: str, body: str, version: str) -> str:
+    """Return a self-contained HTML document with the report's style."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'\">"
         '<meta name="viewport" content="width=device-width">'
-        f"<title>{html.escape(title)}: flight report</title><style>{_STYLE}</style></head><body>"
-        f"{''.join(parts)}<footer>cfplan {html.escape(', '.join(versions))}</footer></body></html>\n"
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>"
+        f"{body}<footer>cfplan {html.escape(version)}</footer></body></html>\n"
     )
 
 
@@ -70,10 +75,10 @@ def _summary(flights: Sequence[ReportedFlight]) -> str:
 def _columns(flights: Sequence[ReportedFlight], rows_of: Callable[[ReportedFlight], list[tuple[str, str]]]) -> str:
     heads = ["", *(flight.name for flight in flights)] if len(flights) > 1 else []
     rows = [(cells[0][0], *(value for _, value in cells)) for cells in zip(*map(rows_of, flights), strict=True)]
-    return _table("numbers", rows, heads=heads)
+    return html_table("numbers", rows, heads=heads)
 
 
-def _table(
+def html_table(
     kind: str, rows: Iterable[Sequence[str]], *, heads: Sequence[str] = (), marks: Iterable[str] = repeat("")
 ) -> str:
     """Return an HTML table of class `kind`; `marks` are the classes of its rows."""
@@ -181,7 +186,7 @@ def _events(flight: ReportedFlight) -> str:
 
 def _event_table(record: Record, entries: Sequence[tuple[float, str, str]]) -> str:
     rows = [(f"{time - record.start:.2f} s", level, text) for time, level, text in entries]
-    return _table("events", rows, marks=[level for _, level, _ in entries])
+    return html_table("events", rows, marks=[level for _, level, _ in entries])
 
 
 def _certificate(flight: ReportedFlight) -> str:
@@ -190,10 +195,10 @@ def _certificate(flight: ReportedFlight) -> str:
         return ""
     heads = ("limit", "worst", "allowed", "share", "at", "where, m")
     marks = ["" if margin.passed else "fail" for margin in certificate.margins]
-    table = _table("numbers", certificate.rows(), heads=heads, marks=marks)
+    table = html_table("numbers", certificate.rows(), heads=heads, marks=marks)
     verdict = "passed" if certificate.passed else '<span class="fail">failed</span>'
     return f"<h3>Certificate of the plan: {verdict}</h3><p>{certificate.samples} samples along the flight.</p>{table}"
 
 
 def _provenance(flight: ReportedFlight) -> str:
-    return f"<h3>Provenance</h3>{_table('provenance', flight.provenance)}"
+    return f"<h3>Provenance</h3>{html_table('provenance', flight.provenance)}"

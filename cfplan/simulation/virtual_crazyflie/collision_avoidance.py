@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.simulation.dynamics.mellinger import ABSOLUTE, MODE_X, VELOCITY_MODE
+from cfplan.simulation.engine.mellinger import ABSOLUTE, MODE_X, VELOCITY_MODE
 from cfplan.simulation.virtual_crazyflie.setpoints import POSITION, VELOCITY, Setpoint
 
 FARTHEST = float(np.finfo(np.float32).max)  # m, of a bounding box that is not set

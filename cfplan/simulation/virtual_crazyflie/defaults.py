@@ -1,9 +1,9 @@
 """The values that parameters have after power-up, and those of them that reach the inner loop."""
 
 from cfplan.flight.firmware import GAIN_PARAMETERS, MellingerGains
-from cfplan.simulation.dynamics.kalman import Prior
+from cfplan.simulation.engine.kalman import Prior
+from cfplan.simulation.engine.pid import default_gains, default_limits
 from cfplan.simulation.virtual_crazyflie.collision_avoidance import FARTHEST
-from cfplan.simulation.virtual_crazyflie.pid import default_gains, default_limits
 
 PID, MELLINGER = 1, 2
 COMPLEMENTARY, KALMAN = 1, 2

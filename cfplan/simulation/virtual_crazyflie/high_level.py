@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.on_board.memory_format import PIECE_SIZE, read_compressed
-from cfplan.simulation.dynamics.mellinger import ON_BOARD
+from cfplan.simulation.engine.mellinger import ON_BOARD
 from cfplan.simulation.virtual_crazyflie.setpoints import (
     ACCELERATION,
     BODY_RATE,
@@ -145,7 +145,7 @@ class HighLevelCommander:
             goal = self._goal(time)
             body_rate = _body_rate(goal)
         self._last = goal
-        setpoint = Setpoint(mode=ON_BOARD.copy())
+        setpoint = Setpoint(mode=np.array(ON_BOARD))
         setpoint.values[POSITION] = goal.position[:3]
         setpoint.values[VELOCITY] = goal.velocity[:3]
         setpoint.values[ACCELERATION] = goal.acceleration[:3]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics.kalman import Filter
+from cfplan.simulation.engine.kalman import Filter
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW, Setpoint

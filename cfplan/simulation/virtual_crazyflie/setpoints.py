@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, decode_one
-from cfplan.simulation.dynamics.mellinger import (
+from cfplan.simulation.engine.layout import SETPOINT_SIZE
+from cfplan.simulation.engine.mellinger import (
     ABSOLUTE,
     DISABLE,
     FULL_STATE,
@@ -19,7 +20,6 @@ from cfplan.simulation.dynamics.mellinger import (
     MODE_YAW,
     MODE_Z,
     NOTHING,
-    SETPOINT_SIZE,
     VELOCITY_MODE,
 )
 
@@ -50,7 +50,7 @@ class Setpoint:
     """Values and modes as in `mellinger`; a new one asks for nothing: motors off."""
 
     values: NDArray = field(default_factory=lambda: np.zeros(SETPOINT_SIZE))  # (20,)
-    mode: NDArray = field(default_factory=NOTHING.copy)  # (7,)
+    mode: NDArray = field(default_factory=lambda: np.array(NOTHING))  # (7,)
     velocity_in_body: bool = False  # horizontal velocity along the body's axes
     tick: int = 0  # when the commander took it
 
@@ -100,7 +100,7 @@ def decode_setpoint(payload: bytes) -> Setpoint:
 def _full_state(payload: bytes) -> Setpoint:
     if len(payload) != PAYLOAD_SIZE:
         raise FirmwareAssert(f"full state with {len(payload)} bytes")
-    setpoint = Setpoint(mode=FULL_STATE.copy())
+    setpoint = Setpoint(mode=np.array(FULL_STATE))
     setpoint.values[POSITION.start : BODY_RATE.stop] = decode_one(payload)
     return setpoint
 

@@ -10,90 +10,99 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics.body import (
+from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.kalman import Filter, estimate, reset, step_filter
+from cfplan.simulation.engine.layout import (
+    AIRFRAME,
+    ASKED,
+    EFFICIENCY,
     FLOOR,
-    FULL_EFFICIENCY,
-    STILL_AIR,
-    TIME_STEP,
+    MEMORY,
+    MEMORY_SIZE,
+    SETPOINT,
+    SETPOINT_SIZE,
+    STATE_SIZE,
+    VEHICLE_SIZE,
+    WIND,
     at_rest,
-    pack_body,
-    step_body,
+    pack_airframe,
 )
-from cfplan.simulation.dynamics.kalman import Filter, estimate, reset, step_filter
-from cfplan.simulation.dynamics.mellinger import (
+from cfplan.simulation.engine.mellinger import (
+    CONTROL_PERIOD,
     DISABLE,
     FULL_COMMAND,
     MODE_Z,
-    distribute_power,
     level_out,
+    mixed,
     step_mellinger,
 )
-from cfplan.simulation.virtual_crazyflie.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
+from cfplan.simulation.engine.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
 from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import axes_of
 
-# Where each flag lies in the array that `run` fills.
+# Where each lies in the array of whole numbers: counts, the setpoint's modes, and what the next run is told.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
+_MODE, _IN_BODY, _ALLOWED, _FLYING, _ASKED, _MELLINGER, _NUMBERS = 3, 10, 11, 12, 13, 14, 15
 
 IN_AIR = 0.05  # m above the floor; a landing ends a little above it
 _NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it has no common period with anything
 
 
 class Loop(NamedTuple):
-    """Everything that the compiled loop reads and changes, in place: all but counts and noise are views of one array.
+    """Everything that the compiled loop reads and changes, in place: views of one array of numbers, but for noise and
+    whole numbers.
 
     To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
     """
 
-    truth: NDArray  # (17,) the body's state, see `body`
+    vehicle: NDArray  # (77,) as in `engine.layout`: body, Mellinger controller, setpoint, airframe
+    truth: NDArray  # (17,) of that the body's state
+    wind: NDArray  # (3,) m/s, of that
+    efficiency: NDArray  # (4,) fraction of its thrust that each motor gives, of that
     kalman: Filter
     belief: NDArray  # (13,) estimated position, velocity, quaternion; body rate as measured
     acceleration: NDArray  # (3,) m/s², specific force as measured, body axes
-    memory: NDArray  # (10,) of the Mellinger controller
     pid_memory: NDArray  # (36,) of the PID controller
     control: NDArray  # (4,)
     motors: NDArray  # (4,) 16-bit commands
-    counts: NDArray  # OFF_TICKS, OFF_IN_AIR_TICKS, RESETS
-    noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
-    wind: NDArray  # (3,) m/s
-    efficiency: NDArray  # (4,) share of its thrust that each motor gives
     override: NDArray  # (5,) motorPowerSet: whether its commands count, 2 and 3 the first for all; 16-bit commands
     idle: NDArray  # (1,) 16-bit command that no motor falls below while it may turn
-    body: NDArray  # (13,) the body's parameters, see `body`
     prior: NDArray  # (16,) the filter's parameters, see `kalman`
     gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
     pid_gains: NDArray  # (12, 5) see `pid`
     pid_limits: NDArray  # (5,)
+    counts: NDArray  # (15,) int: OFF_TICKS, OFF_IN_AIR_TICKS, RESETS, and what the next run is told
+    noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
 
 
-_FLOATS = 318  # of all parts together
+_FLOATS = VEHICLE_SIZE + 271  # of all parts together
 
 
 @register_jitable
 def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
-    """Return the parts of the array (318,) in their order."""
+    """Return the parts of the array in their order."""
+    more = floats[VEHICLE_SIZE:]
     return Loop(
-        truth=floats[0:17],
-        kalman=Filter(floats[17:26], floats[26:30], floats[30:111].reshape(9, 9), floats[111:118], floats[118:122]),
-        belief=floats[122:135],
-        acceleration=floats[135:138],
-        memory=floats[138:148],
-        pid_memory=floats[148:184],
-        control=floats[184:188],
-        motors=floats[188:192],
+        vehicle=floats[:VEHICLE_SIZE],
+        truth=floats[:STATE_SIZE],
+        wind=floats[WIND : WIND + 3],
+        efficiency=floats[EFFICIENCY : EFFICIENCY + 4],
+        kalman=Filter(more[0:9], more[9:13], more[13:94].reshape(9, 9), more[94:101], more[101:105]),
+        belief=more[105:118],
+        acceleration=more[118:121],
+        pid_memory=more[121:157],
+        control=more[157:161],
+        motors=more[161:165],
+        override=more[165:170],
+        idle=more[170:171],
+        prior=more[171:187],
+        gains=more[187:206],
+        pid_gains=more[206:266].reshape(12, 5),
+        pid_limits=more[266:271],
         counts=counts,
         noise=noise,
-        wind=floats[192:195],
-        efficiency=floats[195:199],
-        override=floats[199:204],
-        idle=floats[204:205],
-        body=floats[205:218],
-        prior=floats[218:234],
-        gains=floats[234:253],
-        pid_gains=floats[253:313].reshape(12, 5),
-        pid_limits=floats[313:318],
     )
 
 
@@ -102,23 +111,22 @@ class Stabilizer:
 
     def __init__(self, airframe: Airframe, settings: VehicleSettings, prior: NDArray, gains: NDArray):
         position = np.array(settings.position, dtype=float)
-        self._floats, self._counts = np.zeros(_FLOATS), np.zeros(3, dtype=np.int64)
+        self._floats, self._counts = np.zeros(_FLOATS), np.zeros(_NUMBERS, dtype=np.int64)
         self._noise = _sensor_noise(settings.sensors, settings.seed)
         self.loop = loop = _parts(self._floats, self._counts, self._noise)
         loop.truth[:] = at_rest(position, settings.yaw)
         loop.acceleration[:] = 0.0, 0.0, GRAVITY
-        loop.wind[:], loop.efficiency[:] = STILL_AIR, FULL_EFFICIENCY
-        loop.body[:] = pack_body(airframe, floor=float(position[2]))
+        loop.vehicle[AIRFRAME:] = pack_airframe(airframe, floor=float(position[2]))
         loop.prior[:], loop.gains[:] = prior, gains
         loop.pid_gains[:], loop.pid_limits[:] = default_gains(), default_limits()
         self.mellinger = False  # which of the two controllers flies
+        self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
         reset(loop.kalman, loop.prior)
         estimate(loop.kalman, loop.belief)
-        self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
 
     def reset_controller(self) -> None:
         """Clear the integrals, as the choice of another controller does."""
-        self.loop.memory[:] = 0.0
+        self.loop.vehicle[MEMORY : MEMORY + MEMORY_SIZE] = 0.0
         self.loop.pid_memory[:] = 0.0
 
     def limit_speed(self, axis: int, most: float) -> None:
@@ -133,15 +141,13 @@ class Stabilizer:
         self, tick: int, ticks: int, setpoint: Setpoint, poses: NDArray, *, allowed: bool, level: bool, flying: bool
     ) -> None:
         """Advance from `tick` by `ticks` of 1 ms; `poses` (n, 9) as in `kalman`."""
-        values, mode = setpoint.values, setpoint.mode
+        values, mode = self.loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE], self._counts[_MODE:_IN_BODY]
+        values[:], mode[:] = setpoint.values, setpoint.mode
         if level:
-            values, mode = values.copy(), mode.copy()
             level_out(values, mode)
-        _run(
-            self._floats, self._counts, self._noise, self.mellinger, values, mode, setpoint.velocity_in_body, poses,
-            tick, ticks, allowed, flying, self._per_command,
-            allowed and bool(mode[MODE_Z] != DISABLE or values[THRUST] > 0),
-        )  # fmt: skip
+        asked = allowed and bool(mode[MODE_Z] != DISABLE or values[THRUST] > 0)
+        self._counts[_IN_BODY:] = setpoint.velocity_in_body, allowed, flying, asked, self.mellinger
+        _run(self._floats, self._counts, self._noise, poses, tick, ticks, self._per_command)
 
 
 def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
@@ -154,26 +160,13 @@ def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
     return noise
 
 
-@njit
+@njit(error_model="numpy")
 def _run(
-    floats: NDArray,
-    counts: NDArray,
-    noise: NDArray,
-    mellinger: bool,
-    setpoint: NDArray,
-    mode: NDArray,
-    velocity_in_body: bool,
-    poses: NDArray,
-    tick: int,
-    ticks: int,
-    allowed: bool,
-    flying: bool,
-    per_command: float,
-    asked: bool,
-) -> None:
+    floats: NDArray, counts: NDArray, noise: NDArray, poses: NDArray, tick: int, ticks: int, per_command: float
+) -> None:  # seven, as numba knows no objects
     loop = _parts(floats, counts, noise)
-    gyro, measured, thrusts = np.empty(3), np.empty(3), np.empty(4)
-    none = poses[:0]
+    gyro, measured = np.empty(3), np.empty(3)
+    none, flying = poses[:0], loop.counts[_FLYING] != 0
     for now in range(tick, tick + ticks):
         row = now % len(loop.noise)
         for axis in range(3):
@@ -183,26 +176,34 @@ def _run(
         if not step_filter(loop.kalman, loop.prior, gyro, measured, poses if now == tick else none, now, flying):
             loop.counts[RESETS] += 1
         estimate(loop.kalman, loop.belief)
-
         if now % 2 == 0:
-            if mellinger:
-                step_mellinger(loop.control, loop.memory, loop.gains, setpoint, mode, loop.belief)
-            else:
-                step_pid(
-                    loop.control, loop.pid_memory, loop.pid_gains, loop.pid_limits, setpoint, mode, velocity_in_body,
-                    loop.belief, now,
-                )  # fmt: skip
-            distribute_power(loop.control, loop.motors)
-        _drive(loop, thrusts, allowed, per_command, asked)
+            _control(loop, now)
+        _drive(loop, per_command)
+
+
+@register_jitable
+def _control(loop: Loop, now: int) -> None:
+    """Step the controller that flies, on what the filter believes."""
+    mode = loop.counts[_MODE:_IN_BODY]
+    if loop.counts[_MELLINGER]:
+        control = step_mellinger(loop.vehicle, loop.gains, mode, loop.belief, CONTROL_PERIOD)
+        loop.control[0], loop.control[1], loop.control[2], loop.control[3] = control
+    else:
+        setpoint, in_body = loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE], loop.counts[_IN_BODY] != 0
+        step_pid(
+            loop.control, loop.pid_memory, loop.pid_gains, loop.pid_limits, setpoint, mode, in_body, loop.belief, now
+        )  # fmt: skip
+    commands = mixed((loop.control[0], loop.control[1], loop.control[2], loop.control[3]))
+    loop.motors[0], loop.motors[1], loop.motors[2], loop.motors[3] = commands
 
 
 @njit(allocates=False)
-def _drive(loop: Loop, thrusts: NDArray, allowed: bool, per_command: float, asked: bool) -> None:
+def _drive(loop: Loop, per_command: float) -> None:
     """Turn the motors, move the body, and note what its accelerometer measures.
 
     Motors count as off if nothing asks them to turn, not if the controller wants no thrust for a moment.
     """
-    off = True
+    off, allowed, vehicle = True, loop.counts[_ALLOWED] != 0, loop.vehicle
     for motor in range(4):
         if allowed and not loop.motors[motor] > loop.idle[0]:
             loop.motors[motor] = loop.idle[0]
@@ -211,16 +212,16 @@ def _drive(loop: Loop, thrusts: NDArray, allowed: bool, per_command: float, aske
         if not (allowed and loop.motors[motor] > 0.0):  # NaN is off too, as its cast to an integer is
             loop.motors[motor] = 0.0
         off = off and loop.motors[motor] == 0.0
-        thrusts[motor] = loop.motors[motor] * per_command
-    if off and not asked:
+        vehicle[ASKED + motor] = loop.motors[motor] * per_command
+    if off and loop.counts[_ASKED] == 0:
         loop.counts[OFF_TICKS] += 1
-        if loop.truth[2] > loop.body[FLOOR] + IN_AIR:
+        if vehicle[2] > vehicle[FLOOR] + IN_AIR:
             loop.counts[OFF_IN_AIR_TICKS] += 1
-    vx, vy, vz = loop.truth[3], loop.truth[4], loop.truth[5]
-    step_body(loop.truth, thrusts, loop.body, loop.wind, loop.efficiency)
-    fx, fy = (loop.truth[3] - vx) / TIME_STEP, (loop.truth[4] - vy) / TIME_STEP
-    fz = (loop.truth[5] - vz) / TIME_STEP + GRAVITY
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(loop.truth[6], loop.truth[7], loop.truth[8], loop.truth[9])
+    vx, vy, vz = vehicle[3], vehicle[4], vehicle[5]
+    step_body(vehicle, TIME_STEP)
+    fx, fy, fz = vehicle[3] - vx, vehicle[4] - vy, vehicle[5] - vz
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(vehicle[6], vehicle[7], vehicle[8], vehicle[9])
+    fx, fy, fz = fx / TIME_STEP, fy / TIME_STEP, fz / TIME_STEP + GRAVITY
     loop.acceleration[0] = xx * fx + xy * fy + xz * fz
     loop.acceleration[1] = yx * fx + yy * fy + yz * fz
     loop.acceleration[2] = zx * fx + zy * fy + zz * fz

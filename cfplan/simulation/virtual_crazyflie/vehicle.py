@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cfplan.flight.firmware import GAIN_PARAMETERS, Timeouts
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
-from cfplan.simulation.dynamics.body import MASS, MOTORS, THRUST_MAX
+from cfplan.simulation.engine.layout import MASS, MOTORS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.catalogue import lacking
 from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
@@ -224,7 +224,7 @@ class VirtualCrazyflie:
                 self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
             )
         self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
-        self.stabilizer.loop.body[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
+        self.stabilizer.loop.vehicle[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
         while self._answers and self._answers[0][0] <= self.tick:
             _, answer = self._answers.pop(0)
             self._send(Port.PARAMETERS, answer[0], answer[1:])
@@ -245,7 +245,7 @@ class VirtualCrazyflie:
         if VehicleFaultKind.TUMBLE in acting:
             loop.efficiency[2:4] = 0.0
         loop.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)
-        self.stabilizer.loop.body[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
+        loop.vehicle[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
         if VehicleFaultKind.BATTERY not in acting:
             self.battery.sag = 0.0
         elif self.battery.sag == 0.0:

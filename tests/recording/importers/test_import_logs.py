@@ -5,6 +5,7 @@ import sqlite3
 import struct
 import sys
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from cfplan.errors import InputError
 from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.recording.importers.formats import read_log
 from tests.recording.importers import test_import_vicon as vicon
+
+FLIGHTS = Path(__file__).parents[4] / "shared" / "data" / "flights"
 
 COUNT = 30
 TIMES = np.arange(COUNT) * 0.01
@@ -43,7 +46,7 @@ KALMAN = [f"kalman.{name}(f)" for name in ("stateX", "stateY", "stateZ", "q1", "
 MOCAP = [name.replace("stateEstimate", "locSrv") for name in ESTIMATE]
 
 
-def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.0, other=False):
+def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.0, other=False, times=TIMES):
     """The log of one kind of event, each followed by a record of a second kind, number 0, with one u16 if `other`."""
 
     def kind(number, name, variables):
@@ -53,12 +56,14 @@ def usd(variables, rows, *, version=2, crc=True, name="fixedFrequency", start=5.
     def stamp(time):
         return struct.pack("<Q", round(time * 1e6)) if version == 2 else struct.pack("<I", round(time * 1e3))
 
-    log = struct.pack("<BHH", 0xBC, version, 2) + kind(0xFFFF, name, variables) + kind(0, "estTDOA", ["id(H)"])
+    log = (
+        bytearray(struct.pack("<BHH", 0xBC, version, 2)) + kind(0xFFFF, name, variables) + kind(0, "estTDOA", ["id(H)"])
+    )
     codes = "<" + "".join(variable[-2] for variable in variables)
-    for time, row in zip(TIMES, rows, strict=True):
+    for time, row in zip(times, rows, strict=True):
         log += b"\xff\xff" + stamp(start + time) + struct.pack(codes, *row)
         log += b"\0\0" + stamp(start) + b"\1\0" if other else b""
-    return log + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
+    return bytes(log) + (struct.pack("<I", zlib.crc32(log)) if crc else b"")
 
 
 def old_usd(variables, rows, *, block=8):
@@ -355,6 +360,32 @@ def test_the_compressed_estimate_and_setpoint_are_millimetres_and_a_packed_quate
     np.testing.assert_allclose([estimate.position, setpoint.position], [millimetres / 1000] * 2, atol=1e-9)
     assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 0.005
     assert np.isnan(setpoint.quaternion).all()
+
+
+def test_the_lee_controllers_angles_are_the_attitudes_of_the_compressed_estimate_and_setpoint(tmp_path):
+    _, position, rotations = estimate_rows()
+    millimetres = np.round(position * 1000).astype(int)
+    groups = ("stateEstimateZ", "ctrltargetZ")
+    names = [f"{group}.{axis}(h)" for group in groups for axis in "xyz"]
+    names += [f"ctrlLee.{group}{axis}(f)" for group in ("rpy", "rpyd") for axis in "xyz"]
+    angles = rotations.as_euler("ZYX")[:, ::-1]
+    rows = [(*place, *place, *each, *(-each)) for place, each in zip(millimetres, angles, strict=True)]
+    estimate, setpoint = read_log(written(tmp_path, usd(names, rows))).subjects
+    assert (Rotation.from_quat(estimate.quaternion) * rotations.inv()).magnitude().max() < 1e-6
+    wanted = Rotation.from_euler("ZYX", -angles[:, ::-1])
+    assert (Rotation.from_quat(setpoint.quaternion) * wanted.inv()).magnitude().max() < 1e-6
+
+
+@pytest.mark.parametrize("name", ["log76", "log206"])
+def test_public_logs_of_the_lee_controller_have_setpoint_and_attitude(name):
+    if not (file := FLIGHTS / "original_logs" / name).is_file():
+        pytest.skip("the public flights, ../shared/data/flights, are not here")
+    subjects = {subject.name: subject for subject in read_log(file).subjects}
+    estimate, setpoint = subjects["estimate, compressed"], subjects["setpoint, compressed"]
+    for subject in (estimate, setpoint):
+        assert np.isfinite(subject.quaternion).all()
+        assert Rotation.from_quat(subject.quaternion).as_matrix()[:, 2, 2].min() > 0.7  # upright
+    assert np.linalg.norm(estimate.position - setpoint.position, axis=1).max() < 0.3
 
 
 def test_roll_pitch_and_yaw_are_those_of_the_firmware_whose_pitch_is_nose_up(tmp_path):

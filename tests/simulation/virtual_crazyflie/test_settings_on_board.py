@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from cfplan.simulation.dynamics.mellinger import ABSOLUTE, FULL_STATE, MODE_X, VELOCITY_MODE
+from cfplan.simulation.engine.mellinger import ABSOLUTE, FULL_STATE, MODE_X, VELOCITY_MODE
 from cfplan.simulation.virtual_crazyflie.catalogue import CAME_WITH, lacking
 from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
 from cfplan.simulation.virtual_crazyflie.commander import Priority
@@ -30,7 +30,7 @@ SLACK = 1e-4
 
 
 def full_state(position, velocity, acceleration=(1.0, 2.0, 3.0), body_rate=(0.1, 0.2, 0.3)):
-    setpoint = Setpoint(mode=FULL_STATE.copy())
+    setpoint = Setpoint(mode=np.array(FULL_STATE))
     setpoint.values[POSITION], setpoint.values[VELOCITY] = position, velocity
     setpoint.values[ACCELERATION], setpoint.values[BODY_RATE] = acceleration, body_rate
     return setpoint

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+from one_body import stepped
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.simulation.dynamics.body import FULL_EFFICIENCY, STILL_AIR, TIME_STEP, pack_body, step_body
+from cfplan.simulation.engine.layout import pack_airframe
 from cfplan.simulation.geometric_flight import fly_geometric, positions_by_both
 from studies.paper.simulators import (
     HARDWARE,
@@ -30,10 +31,7 @@ def trajectory():
 
 
 def own_step(state, asked, seconds):
-    state, body = state.copy(), pack_body(FLOWN, floor=-np.inf)
-    for _ in range(round(seconds / TIME_STEP)):
-        step_body(state, np.asarray(asked), body, STILL_AIR, FULL_EFFICIENCY)
-    return state
+    return stepped(state, asked, pack_airframe(FLOWN, floor=-np.inf), seconds)
 
 
 def test_with_cfplans_own_body_it_is_the_flight_of_the_tables(trajectory):

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics.body import POSITION, STATE_SIZE, TIME_STEP, pack_body, step_body
+from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.layout import ASKED, POSITION, STATE_SIZE, new_vehicle, pack_airframe
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import axes_of, hopf_quaternion
 from cfplan.vehicle.trajectory import FullState
@@ -26,6 +27,7 @@ VELOCITY_GAINS = (5.5, 5.5, 8.7)  # 1/s
 ATTITUDE_GAINS = (2812.0, 2812.0, 163.0)  # 1/s²
 RATE_GAINS = (128.0, 128.0, 73.0)  # 1/s
 BodyStep = Callable[[NDArray, NDArray, float], NDArray]  # as in `other_bodies`
+_Believed = tuple[NDArray, NDArray, float]  # inertia (3,), thrusts from a wrench (4, 4), mass
 _GAINS = np.array([POSITION_GAINS, VELOCITY_GAINS, ATTITUDE_GAINS, RATE_GAINS])
 
 
@@ -34,7 +36,7 @@ class GeometricFlight:
     """The vehicle's motion, every millisecond from the start to the end."""
 
     time: NDArray  # (N,) s
-    states: NDArray  # (N, 17) as in `body`
+    states: NDArray  # (N, 17) as in `layout`
     asked: NDArray  # (N, 4) N, thrust that the controller asks of each motor, not held within their range
 
 
@@ -54,53 +56,46 @@ def follow(reference: NDArray, airframe: Airframe, start: NDArray) -> GeometricF
     """
     steps = CONTROL_STEPS * len(reference)
     states, asked = np.empty((steps + 1, STATE_SIZE)), np.zeros((steps + 1, 4))
-    states[0] = start
-    _follow(states, asked, reference, *_packed(airframe))
+    vehicle = new_vehicle(start, pack_airframe(airframe, floor=-np.inf))
+    _follow(states, asked, reference, vehicle, _packed(airframe))
     return GeometricFlight(np.arange(steps + 1) * TIME_STEP, states, asked)
 
 
 def follow_by(step: BodyStep, reference: NDArray, airframe: Airframe, start: NDArray) -> NDArray:
     """Return positions, (K, 3) m, of another body that the controller flies along the reference, as `follow` does."""
     state, command, positions = start.copy(), np.zeros(4), np.empty((len(reference), 3))
-    _, inertia, thrusts, mass = _packed(airframe)
+    packed = _packed(airframe)
     for row, wanted in enumerate(reference):
         positions[row] = state[POSITION]
         if not np.isfinite(state).all():
             positions[row:] = np.nan
             break
-        _control(command, wanted, state, inertia, thrusts, mass)
+        _control(command, wanted, state, packed)
         state = step(state, command, CONTROL_STEPS * TIME_STEP)
     return positions
 
 
-def _packed(airframe: Airframe) -> tuple[NDArray, NDArray, NDArray, float]:
-    """Return the body's parameters, inertia, thrusts from a wrench (4, 4), and mass."""
-    return (
-        pack_body(airframe, floor=-np.inf), np.array(airframe.inertia), np.linalg.inv(airframe.mixing), airframe.mass
-    )  # fmt: skip
+def _packed(airframe: Airframe) -> _Believed:
+    """Return inertia, thrusts from a wrench (4, 4), and mass."""
+    return np.array(airframe.inertia), np.linalg.inv(airframe.mixing), airframe.mass
 
 
 @njit(error_model="numpy")
-def _follow(
-    states: NDArray, asked: NDArray, reference: NDArray, body: NDArray, inertia: NDArray, thrusts: NDArray, mass: float
-) -> None:
-    state, command = states[0].copy(), np.zeros(4)
-    still, whole = np.zeros(3), np.ones(4)
+def _follow(states: NDArray, asked: NDArray, reference: NDArray, vehicle: NDArray, believed: _Believed) -> None:
     for row in range(len(reference)):
-        _control(command, reference[row], state, inertia, thrusts, mass)
+        _control(vehicle[ASKED : ASKED + 4], reference[row], vehicle, believed)
         for k in range(CONTROL_STEPS):
             step = CONTROL_STEPS * row + k
-            asked[step] = command
-            step_body(state, command, body, still, whole)
-            states[step + 1] = state
-    asked[-1] = command
+            states[step] = vehicle[:STATE_SIZE]
+            asked[step] = vehicle[ASKED : ASKED + 4]
+            step_body(vehicle, TIME_STEP)
+    states[-1], asked[-1] = vehicle[:STATE_SIZE], vehicle[ASKED : ASKED + 4]
 
 
 @njit(error_model="numpy")
-def _control(
-    command: NDArray, wanted: NDArray, state: NDArray, inertia: NDArray, thrusts: NDArray, mass: float
-) -> None:
+def _control(command: NDArray, wanted: NDArray, state: NDArray, believed: _Believed) -> None:
     """Write the thrust to ask of each motor, (4,) N."""
+    inertia, thrusts, mass = believed
     force, error, rate, turning, wrench = np.empty(3), np.empty(3), np.zeros(3), np.zeros(3), np.zeros(4)
     for k in range(3):
         force[k] = wanted[FORCE + k] + _GAINS[0, k] * (wanted[k] - state[k])

@@ -10,8 +10,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.limit_sets import PAPER
-from cfplan.simulation.dynamics.body import POSITION, QUATERNION, hovering
-from cfplan.simulation.dynamics.geometric import (
+from cfplan.simulation.engine.geometric import (
     ATTITUDE_GAINS,
     POSITION_GAINS,
     RATE,
@@ -21,6 +20,7 @@ from cfplan.simulation.dynamics.geometric import (
     follow,
     reference_rows,
 )
+from cfplan.simulation.engine.layout import POSITION, QUATERNION, hovering
 from cfplan.simulation.geometric_flight import LOST, fly_geometric, nearest_states, thrust_violation
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, yaw_of

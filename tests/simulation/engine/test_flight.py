@@ -7,8 +7,8 @@ import pytest
 
 from cfplan.flight.firmware import MellingerGains
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.simulation.dynamics.body import hovering
-from cfplan.simulation.dynamics.closed_loop import EstimateErrors, fly_setpoints
+from cfplan.simulation.engine.flight import Conditions, EstimateErrors, fly_setpoints
+from cfplan.simulation.engine.layout import hovering
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -17,7 +17,6 @@ HERE = np.array([[0.5, -0.5, 1.0]])
 NOTHING = np.zeros((1, 3))
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 HOVER = FullStateSetpoints(HERE, NOTHING, NOTHING, LEVEL, NOTHING)
-NO_FLOOR = -np.inf
 
 
 def airframe_of(flown) -> Airframe:
@@ -42,8 +41,7 @@ def test_the_firmwares_flights_are_flown_again_to_a_hundredth_of_a_millimetre(fi
         airframe,
         start,
         duration=float(flown["t"][-1]),
-        gains=MellingerGains(mass=airframe.mass),
-        floor=NO_FLOOR,
+        conditions=Conditions(MellingerGains(mass=airframe.mass)),
     )
     rows = slice(None, None, 10)
     assert loop.time[rows] == pytest.approx(flown["t"], abs=1e-6)
@@ -72,7 +70,11 @@ def test_yaw_would_be_unstable_at_this_motor_lag_without_the_rotors_reaction():
         start = hovering(bare, HERE[0])
         start[12] = 0.02
         loop = fly_setpoints(
-            HOVER, np.zeros(1), replace(bare, motor_time_constant=lag), start, duration=6.0, floor=NO_FLOOR
+            HOVER,
+            np.zeros(1),
+            replace(bare, motor_time_constant=lag),
+            start,
+            duration=6.0,
         )
         early, late = (np.abs(loop.body_rate[part, 2]).max() for part in (slice(1000, 2000), slice(5000, 6000)))
         growth.append(late / early)
@@ -95,7 +97,7 @@ def test_it_takes_off_from_the_floor_and_lands_on_it():
     )
     start = hovering(AIRFRAME, np.zeros(3))
     start[13:17] = 0.0
-    loop = fly_setpoints(setpoints, seconds, AIRFRAME, start, duration=8.0)
+    loop = fly_setpoints(setpoints, seconds, AIRFRAME, start, 8.0, Conditions(floor=0.0))
     assert loop.position[:, 2].min() == 0.0
     assert loop.position[2500, 2] == pytest.approx(0.5, abs=0.05)
     assert loop.position[-1, 2] == 0.0
@@ -107,7 +109,8 @@ def test_setpoints_count_from_when_they_arrive():
     )
     start = hovering(AIRFRAME, HERE[0])
     due, late = (
-        fly_setpoints(moved, np.array([0.0, 0.1]), AIRFRAME, start, duration=0.5, delay=delay) for delay in (0.0, 0.02)
+        fly_setpoints(moved, np.array([0.0, 0.1]), AIRFRAME, start, 0.5, Conditions(delay=delay))
+        for delay in (0.0, 0.02)
     )
     assert late.states[20:] == pytest.approx(due.states[:-20], abs=1e-4)
     assert not np.allclose(late.states, due.states, atol=1e-4)
@@ -125,7 +128,14 @@ def test_a_late_estimate_leaves_a_flight_ahead_by_speed_times_latency():
     start = hovering(frame, HERE[0])
     start[3:6] = speed
     known, late = (
-        fly_setpoints(setpoints, seconds, frame, start, duration=4.0, estimate=EstimateErrors(latency=latency))
+        fly_setpoints(
+            setpoints,
+            seconds,
+            frame,
+            start,
+            duration=4.0,
+            conditions=Conditions(estimate=EstimateErrors(latency=latency)),
+        )
         for latency in (0.0, 0.03)
     )
     assert late.position[-1, 0] - known.position[-1, 0] == pytest.approx(0.03, rel=0.1)
@@ -135,7 +145,12 @@ def test_noise_is_the_same_for_the_same_seed():
     start = hovering(AIRFRAME, HERE[0])
     noisy = [
         fly_setpoints(
-            HOVER, np.zeros(1), AIRFRAME, start, duration=0.5, estimate=EstimateErrors(position_noise=0.01, seed=seed)
+            HOVER,
+            np.zeros(1),
+            AIRFRAME,
+            start,
+            duration=0.5,
+            conditions=Conditions(estimate=EstimateErrors(position_noise=0.01, seed=seed)),
         )
         for seed in (1, 1, 2)
     ]
@@ -146,8 +161,8 @@ def test_noise_is_the_same_for_the_same_seed():
 def test_wind_and_a_weak_motor_are_felt():
     start = hovering(AIRFRAME, HERE[0])
     calm = fly_setpoints(HOVER, np.zeros(1), AIRFRAME, start, duration=2.0)
-    blown = fly_setpoints(HOVER, np.zeros(1), AIRFRAME, start, duration=2.0, wind=np.array([2.0, 0.0, 0.0]))
-    weak = fly_setpoints(HOVER, np.zeros(1), AIRFRAME, start, duration=2.0, efficiency=np.array([0.8, 1, 1, 1]))
+    blown = fly_setpoints(HOVER, np.zeros(1), AIRFRAME, start, 2.0, Conditions(wind=np.array([2.0, 0.0, 0.0])))
+    weak = fly_setpoints(HOVER, np.zeros(1), AIRFRAME, start, 2.0, Conditions(efficiency=np.array([0.8, 1, 1, 1])))
     assert calm.position[-1] == pytest.approx(HERE[0], abs=1e-3)
     assert blown.position[-1, 0] > HERE[0, 0] + 0.02
     assert np.median(weak.commands[-500:, 0]) > 1.1 * np.median(weak.commands[-500:, 2])

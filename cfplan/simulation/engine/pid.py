@@ -15,7 +15,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.dynamics.mellinger import (
+from cfplan.simulation.engine.mellinger import (
     ABSOLUTE,
     DISABLE,
     FULL_COMMAND,

@@ -5,21 +5,32 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.flight.firmware import MellingerGains
-from cfplan.simulation.dynamics.body import BODY_RATE, POSITION, QUATERNION, VELOCITY, at_rest
-from cfplan.simulation.dynamics.mellinger import (
+from cfplan.simulation.engine.layout import (
+    BODY_RATE,
+    MEMORY,
+    MEMORY_SIZE,
+    POSITION,
+    QUATERNION,
+    SETPOINT,
+    SETPOINT_SIZE,
+    VEHICLE_SIZE,
+    VELOCITY,
+    at_rest,
+)
+from cfplan.simulation.engine.mellinger import (
     ABSOLUTE,
+    CONTROL_PERIOD,
     FULL_COMMAND,
     FULL_STATE,
-    MEMORY_SIZE,
+    LEVEL_OUT,
     MODE_PITCH,
     MODE_ROLL,
     MODE_YAW,
     NOTHING,
     ON_BOARD,
-    SETPOINT_SIZE,
     VELOCITY_MODE,
-    distribute_power,
     level_out,
+    mixed,
     step_mellinger,
 )
 from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS
@@ -37,22 +48,22 @@ def hover_setpoint(position, yaw=0.0):
     return setpoint
 
 
-def control_of(setpoint, mode, state, memory=None):
-    control = np.zeros(4)
-    step_mellinger(control, np.zeros(MEMORY_SIZE) if memory is None else memory, GAINS, setpoint, mode, state)
-    return control
+def control_of(setpoint, mode, state, memory=None, gains=GAINS):
+    """The control, (4,); `memory`, (10,), changes in place."""
+    vehicle, memory = np.zeros(VEHICLE_SIZE), np.zeros(MEMORY_SIZE) if memory is None else memory
+    vehicle[MEMORY : MEMORY + MEMORY_SIZE], vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = memory, setpoint
+    control = step_mellinger(vehicle, gains, mode, state, CONTROL_PERIOD)
+    memory[:] = vehicle[MEMORY : MEMORY + MEMORY_SIZE]
+    return np.array(control)
 
 
 def motors_of(control):
-    motors = np.zeros(4)
-    distribute_power(np.asarray(control, dtype=float), motors)
-    return motors
+    return np.array(mixed(tuple(float(each) for each in control)))
 
 
 def test_control_and_motors_are_the_firmwares(firmware):
     recorded = firmware("mellinger")
     gains = MellingerGains(mass=float(recorded["mass"])).pack()
-    control, motors = np.zeros(4), np.zeros(4)
     for setpoints, states, controls, thrusts in zip(
         recorded["setpoint"], recorded["state"], recorded["control"], recorded["motor_thrust_N"], strict=True
     ):
@@ -60,9 +71,8 @@ def test_control_and_motors_are_the_firmwares(firmware):
         ours, our_thrusts = np.empty((300, 4)), np.empty((300, 4))
         for k in range(300):
             setpoint = np.append(setpoints[k].astype(float), np.zeros(4))
-            step_mellinger(control, memory, gains, setpoint, FULL_STATE, states[k].astype(float))
-            distribute_power(control, motors)
-            ours[k], our_thrusts[k] = control, motors / FULL_COMMAND * 0.12
+            ours[k] = control_of(setpoint, FULL_STATE, states[k].astype(float), memory, gains)
+            our_thrusts[k] = motors_of(ours[k]) / FULL_COMMAND * 0.12
         assert np.all(np.abs(ours - controls) <= 1e-3 * np.ptp(controls, axis=0))
         assert np.all(np.abs(our_thrusts - thrusts) <= 1e-3 * np.ptp(thrusts, axis=0))
 
@@ -131,9 +141,10 @@ def test_a_stop_setpoint_stops_the_motors_and_clears_the_integrals():
 
 def test_level_out_lets_go_of_place_and_keeps_height_and_heading():
     state = at_rest([1.0, 1.0, 1.0], yaw=0.8)
-    setpoint, mode = hover_setpoint([0.0, 0.0, 1.2], yaw=0.0), FULL_STATE.copy()
+    setpoint, mode = hover_setpoint([0.0, 0.0, 1.2], yaw=0.0), np.array(FULL_STATE)
     setpoint[15] = 2.0
     level_out(setpoint, mode)
+    assert tuple(mode) == LEVEL_OUT
     control = control_of(setpoint, mode, state)
     lift = MASS * GRAVITY + 1.25 * 0.2 + 0.05 * 0.2 * 0.002
     assert control == pytest.approx([132000 * lift, 0, 0, 0], abs=1e-6)

@@ -1,0 +1,241 @@
+"""The closed loop with the estimator in it: body, sensors, poses, Kalman filter and controller, compiled.
+
+A dry run on the true state leaves out what the filter believes. Its gyroscope and accelerometer pass the firmware's
+low-passes (80 and 30 Hz), poses arrive late, the filter knows no drag, and the controller, Lee's or Mellinger's, flies
+on what it believes. At each millisecond: sensors, a pose if one arrives, the filter, every second time the controller,
+the body.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+from scipy.signal import butter
+
+from cfplan.flight.firmware import MellingerGains
+from cfplan.machine_code import njit
+from cfplan.simulation.engine import lee, mellinger
+from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.kalman import Filter, Prior, estimate, new_filter, step_filter
+from cfplan.simulation.engine.layout import (
+    ASKED,
+    MEMORY,
+    MEMORY_SIZE,
+    MOTORS,
+    SETPOINT,
+    SETPOINT_SIZE,
+    STATE_SIZE,
+    THRUST_SCALE,
+    new_vehicle,
+    pack_airframe,
+)
+from cfplan.simulation.engine.lee import LeeGains
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.rotations import axes_of, matrix_of, yaw_of
+
+BELIEF_SIZE = 13
+POSE_LATENCY = 0.005  # s; public logs: 3 to 8 ms
+GYRO_CUTOFF, ACCELEROMETER_CUTOFF = 80.0, 30.0  # Hz, of the firmware's low-passes
+_SETTLING = 4000  # ms of hover in which the filter's covariance settles
+_POSE_PERIOD = 10  # ms, while it settles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatorInput:
+    """The poses that a vehicle was sent, and the parameters of its filter."""
+
+    time: NDArray  # (M,) s, when each arrived
+    latency: float = POSE_LATENCY  # s
+    with_attitude: bool = True  # a single marker gives none
+    position_deviation: float = 0.001  # m, as the filter is told (locSrv.extPosStdDev)
+    attitude_deviation: float = 0.05  # rad (locSrv.extQuatStdDev)
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s that the filter knows (kalman.dragB)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatedFlight:
+    """What a simulated vehicle did and believed, every millisecond."""
+
+    states: NDArray  # (N, 17) as in `layout`
+    beliefs: NDArray  # (N, 13) estimated position, velocity, quaternion; body rate as measured
+    control: NDArray  # (N, 4) thrust N and torques N m that the controller asked for
+
+
+class _Loop(NamedTuple):
+    """The arrays of the compiled loop; those of the flight are filled."""
+
+    states: NDArray
+    beliefs: NDArray
+    control: NDArray
+    setpoints: NDArray  # (K, 14 or 20) as the controller takes them
+    changes: NDArray  # (K,) ms at which each comes into force
+    mode: mellinger.Modes  # (7,) of Mellinger's
+    gains: NDArray
+    vehicle: NDArray  # (77,) as in `layout`: body, memory of the controller, setpoint, airframe
+    levers: NDArray  # (5,) arm m, yaw torque per thrust m, most thrust of a motor N, N per 16-bit unit, by Mellinger
+    scale: NDArray  # (N,) the body's thrust scale, which falls with the battery
+    arrivals: NDArray  # (M,) ms of each pose
+    pose: NDArray  # (4,) latency ms, with attitude, standard deviations m and rad
+    kalman: Filter
+    prior: NDArray
+    lowpass: NDArray  # (2, 5) of gyroscope and accelerometer
+
+
+def fly_with_estimator(
+    gains: LeeGains | MellingerGains,
+    setpoints: NDArray,
+    times: NDArray,
+    airframe: Airframe,
+    start: NDArray,
+    poses: EstimatorInput,
+    *,
+    scale: NDArray,
+    mode: mellinger.Modes = mellinger.ON_BOARD,
+    memory: NDArray | None = None,
+    estimator: bool = True,
+) -> EstimatedFlight:
+    """Fly setpoints, (K, 14 or 20) as the controller of the gains takes them, from `start`, (13,).
+
+    They come into force at `times`, (K,) s; the first holds before. `scale`, (N,), is the thrust scale at each
+    millisecond of the flight; `mode` is that of Mellinger's setpoints, `memory` the controller's at the start.
+    Without the estimator the controller knows the true state.
+    """
+    by_lee = isinstance(gains, LeeGains)
+    steps = len(scale)
+    states, beliefs = np.zeros((steps, STATE_SIZE)), np.zeros((steps, BELIEF_SIZE))
+    states[0, :BELIEF_SIZE] = beliefs[0] = start
+    states[0, MOTORS] = airframe.hover_thrust
+    vehicle = new_vehicle(states[0], pack_airframe(airframe, floor=-np.inf))
+    if memory is not None:
+        vehicle[MEMORY : MEMORY + len(memory)] = memory
+    most = airframe.motor_thrust_max
+    per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
+    prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
+    pose = np.array([
+        round(poses.latency / TIME_STEP), poses.with_attitude, poses.position_deviation, poses.attitude_deviation
+    ])  # fmt: skip
+    loop = _Loop(
+        states=states,
+        beliefs=beliefs,
+        control=np.zeros((steps, 4)),
+        setpoints=np.ascontiguousarray(setpoints, dtype=float),
+        changes=np.round(times / TIME_STEP).astype(np.int64),
+        mode=mode,
+        gains=gains.pack(),
+        vehicle=vehicle,
+        levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
+        scale=np.asarray(scale, dtype=float),
+        arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
+        pose=pose,
+        kalman=_settled(start, pose, prior),
+        prior=prior,
+        lowpass=np.stack([_lowpass(GYRO_CUTOFF), _lowpass(ACCELEROMETER_CUTOFF)]),
+    )
+    _run(loop, estimator)
+    return EstimatedFlight(states, beliefs, loop.control)
+
+
+def _lowpass(cutoff: float) -> NDArray:
+    """Return the coefficients, (5,), of the firmware's second-order low-pass."""
+    above, below = butter(2, cutoff, fs=1.0 / TIME_STEP)
+    return np.array([*above, *below[1:]])
+
+
+def _settled(start: NDArray, pose: NDArray, prior: NDArray) -> Filter:
+    """Return a filter whose covariance has settled in hover, and which believes `start`."""
+    kalman = new_filter(prior)
+    row = np.zeros((1, 9))
+    half = 0.5 * yaw_of(start[6:10])
+    level = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
+    row[0, :3], row[0, 3:7], row[0, 7:] = start[:3], level * pose[1], pose[2:]
+    kalman.state[:3], kalman.quaternion[:] = start[:3], level
+    _settle(kalman, prior, row)
+    kalman.state[:3], kalman.state[3:6] = start[:3], matrix_of(start[6:10]).T @ start[3:6]
+    kalman.quaternion[:] = start[6:10]
+    return kalman
+
+
+@njit
+def _settle(kalman: Filter, prior: NDArray, row: NDArray) -> None:
+    still, hover = np.zeros(3), np.array([0.0, 0.0, GRAVITY])
+    for tick in range(_SETTLING):
+        step_filter(kalman, prior, still, hover, row if tick % _POSE_PERIOD == 0 else row[:0], tick, True)
+
+
+@njit
+def _run(loop: _Loop, estimator: bool) -> None:
+    vehicle, belief, control = loop.vehicle, loop.beliefs[0].copy(), np.zeros(4)
+    state = vehicle[:STATE_SIZE]
+    vehicle[ASKED : ASKED + 4] = state[13:17] / loop.scale[0]
+    rates, forces = np.zeros(3), np.array([0.0, 0.0, GRAVITY])  # as they are, and as they pass the low-passes
+    gyro, acceleration, past = state[10:13].copy(), forces.copy(), np.zeros((2, 3, 2))
+    for _ in range(200):
+        _filter(loop.lowpass[0], past[0], state[10:13], gyro)
+        _filter(loop.lowpass[1], past[1], forces, acceleration)
+    row, arrived, newest = np.zeros((1, 9)), 0, 0
+    for step in range(len(loop.states)):
+        loop.states[step] = state
+        for axis in range(3):
+            rates[axis] = state[10 + axis]
+        _filter(loop.lowpass[0], past[0], rates, gyro)
+        _filter(loop.lowpass[1], past[1], forces, acceleration)
+        count = 0
+        if arrived < len(loop.arrivals) and loop.arrivals[arrived] <= step:
+            _write_pose(row, loop, max(loop.arrivals[arrived] - int(loop.pose[0]), 0))
+            arrived, count = arrived + 1, 1
+        if estimator:
+            step_filter(loop.kalman, loop.prior, gyro, acceleration, row[:count], step, True)
+            estimate(loop.kalman, belief)
+        else:
+            belief[:10] = state[:10]
+        belief[10:13] = gyro
+        loop.beliefs[step] = belief
+        while newest + 1 < len(loop.changes) and loop.changes[newest + 1] <= step:
+            newest += 1
+        if step % 2 == 0:
+            _control(loop, loop.setpoints[newest], belief, control)
+        loop.control[step] = control
+        vehicle[THRUST_SCALE] = loop.scale[step]
+        vx, vy, vz = state[3], state[4], state[5]
+        step_body(vehicle, TIME_STEP)
+        fx, fy, fz = (state[3] - vx) / TIME_STEP, (state[4] - vy) / TIME_STEP, (state[5] - vz) / TIME_STEP + GRAVITY
+        axes = axes_of(state[6], state[7], state[8], state[9])
+        for axis in range(3):
+            forces[axis] = axes[axis][0] * fx + axes[axis][1] * fy + axes[axis][2] * fz
+
+
+@register_jitable
+def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) -> None:
+    """Ask the controller: write thrust and torques, and ask the motors."""
+    arm, twist, most, per_unit, by_mellinger = loop.levers
+    asked = loop.vehicle[ASKED : ASKED + 4]
+    if by_mellinger == 0.0:
+        lee.step_lee(control, loop.vehicle[MEMORY : MEMORY + MEMORY_SIZE], loop.gains, setpoint, belief, 2 * TIME_STEP)
+        lee.divide_power(control, (arm, twist), most, asked)
+        return
+    loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoint
+    units = mellinger.step_mellinger(loop.vehicle, loop.gains, loop.mode, belief, 2 * TIME_STEP)
+    control[0], control[1] = 4 * per_unit * units[0], 2 * arm * per_unit * units[1]
+    control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # its signs are older
+    commands = mellinger.mixed(units)
+    for motor in range(4):
+        asked[motor] = commands[motor] * per_unit
+
+
+@register_jitable
+def _write_pose(row: NDArray, loop: _Loop, seen: int) -> None:
+    for k in range(7):
+        row[0, k] = loop.states[seen, k if k < 3 else 3 + k]
+    for k in range(3, 7):
+        row[0, k] *= loop.pose[1]
+    row[0, 7], row[0, 8] = loop.pose[2], loop.pose[3]
+
+
+@register_jitable
+def _filter(lowpass: NDArray, past: NDArray, values: NDArray, out: NDArray) -> None:
+    for axis in range(3):
+        out[axis] = lowpass[0] * values[axis] + past[axis, 0]
+        past[axis, 0] = lowpass[1] * values[axis] - lowpass[3] * out[axis] + past[axis, 1]
+        past[axis, 1] = lowpass[2] * values[axis] - lowpass[4] * out[axis]
