@@ -4,7 +4,6 @@ It starts in hover at the start, receives each payload when it is due and hovers
 the true state. Its motion is compared with the limits at which the pilot would brake.
 """
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -16,7 +15,6 @@ from numpy.typing import NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
-from cfplan.machine_code import njit
 from cfplan.safety.limits import FlightLimits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.simulation.engine.body import TIME_STEP
@@ -148,7 +146,7 @@ def fly_and_judge(
     limits: FlightLimits,
 ) -> DryRun:
     """Call fly(duration=…), s; compare with where the vehicle is wanted at times (N,), (N, 3) m, for `moving`, s."""
-    fly(duration=0.0)  # compiles if need be, as does the next line
+    fly(duration=0.0)  # compiles if need be; the next line imports
     _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
     begun = time.perf_counter()
     loop = fly(duration=duration)
@@ -217,41 +215,15 @@ def _fault(run: Rehearsal, limits: FlightLimits) -> str:
 
 def _lasting(values: NDArray, patience: float) -> float:
     """Return the highest value below which the values do not fall for `patience`, s; less at the ends."""
+    from scipy.ndimage import minimum_filter1d  # slow to import
+
     window = min(max(1, round(patience / TIME_STEP)), len(values))
     values = np.where(np.isfinite(values), values, np.inf)
-    # Repeated ends stand for what is not simulated any more.
-    first, last = np.full(window // 2, values[0]), np.full(window - 1 - window // 2, values[-1])
-    lowest, covered = np.concatenate([first, values, last]), 1
-    while covered < window:  # the lowest of so many from each place on is that of two runs, which may overlap
-        more = min(covered, window - covered)
-        lowest, covered = np.minimum(lowest[:-more], lowest[more:]), covered + more
-    return float(lowest.max())
+    return float(minimum_filter1d(values, window, mode="nearest").max())  # ends stand for what is not simulated
 
 
-@njit(nogil=True)
 def _distances_to_path(positions: NDArray, wanted: NDArray) -> NDArray:
-    """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (N, 3) too, in order of time.
+    """Return the distance of each position, (N, 3), to the nearest of the wanted ones, (M, 3)."""
+    from scipy.spatial import KDTree
 
-    The search goes from the same moment both ways. Where the distance exceeds the nearest one by some steps, it skips
-    as many: consecutive points are at most the longest step apart.
-    """
-    longest = 0.0
-    for n in range(len(wanted) - 1):
-        longest = max(longest, _distance(wanted[n], wanted[n + 1]))
-    out = np.empty(len(positions))
-    for n in range(len(positions)):
-        nearest = _distance(positions[n], wanted[n])
-        for direction in (-1, 1):
-            place = n + direction
-            while 0 <= place < len(wanted):
-                distance = _distance(positions[n], wanted[place])
-                nearest = min(nearest, distance)
-                skipped = (distance - nearest) / longest if longest > 0.0 else float(len(wanted))
-                place += direction * max(1, int(min(skipped, float(len(wanted)))))
-        out[n] = nearest
-    return out
-
-
-@njit
-def _distance(first: NDArray, second: NDArray) -> float:
-    return math.sqrt((first[0] - second[0]) ** 2 + (first[1] - second[1]) ** 2 + (first[2] - second[2]) ** 2)
+    return np.asarray(KDTree(wanted).query(positions)[0])

@@ -17,7 +17,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import RATE
@@ -136,6 +135,8 @@ class _Flight(NamedTuple):
 
 def _fly_without(payloads: NDArray, limits: Limits, rate: float, gap: float, start: NDArray | None) -> _Flight:
     """Fly without a gap, and look as far on from each setpoint as for one of `gap`, s."""
+    from scipy.ndimage import maximum_filter1d  # slow to import
+
     state, first, watched = decode(payloads), np.zeros(1, dtype=np.int64), round(1000 * (gap + AFTERWARDS))
     rows, arrivals = setpoint_rows(state), arrival_times(len(payloads), rate)
     begin = hovering_snapshot(limits.airframe, state) if start is None else start
