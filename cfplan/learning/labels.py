@@ -23,7 +23,7 @@ from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LimitSet
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
-from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.airframe import UNPLANNED, Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
 _LIMITS = 1  # stream of random numbers of limits, vehicles and yaw
@@ -36,8 +36,9 @@ _TYPES = {
 }  # of an airframe's and of limits' fields; the rest are several numbers
 
 
-def _fields_of(kind: Any) -> pa.DataType:
-    return pa.struct([(field.name, _TYPES.get(str(field.type), _NUMBERS)) for field in fields(kind)])
+def _fields_of(kind: Any, without: frozenset[str] = frozenset()) -> pa.DataType:
+    kept = [field for field in fields(kind) if field.name not in without]
+    return pa.struct([(field.name, _TYPES.get(str(field.type), _NUMBERS)) for field in kept])
 
 
 SCHEMA = pa.schema(
@@ -47,7 +48,7 @@ SCHEMA = pa.schema(
         ("copy", pa.int32()),  # 0 the clean path, then its perturbed copies
         ("seed", pa.int64()),
         ("family", pa.string()),  # of the path; "box" in one of the spec's boxes
-        ("airframe", _fields_of(Airframe)),
+        ("airframe", _fields_of(Airframe, UNPLANNED)),
         ("limits", _fields_of(PlanLimits)),
         ("yaw_mode", pa.string()),
         ("yaw_angle", pa.float64()),  # rad

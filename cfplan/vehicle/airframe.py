@@ -75,6 +75,12 @@ class Airframe:
         return np.vstack([np.ones(4), levers[:, None] * MOTOR_TORQUE_SIGNS])
 
 
+UNPLANNED = frozenset(
+    ("velocity_moment", "thrust_scale", "thrust_curvature", "lift_with_speed", "voltage_sag", "motor_curve", "spread")
+)
+"""Fields that a simulated vehicle has and plans do not know, so that datasets need not hold them."""
+
+
 def airframe_of(values: Mapping[str, Any]) -> Airframe:
     """Return the airframe of plain data as `asdict` makes it; null is NaN.
 
