@@ -16,7 +16,7 @@ from cfplan.errors import (
 from cfplan.version import __version__
 
 if TYPE_CHECKING:
-    from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
+    from cfplan.air.requests import PathAnswer, PathVerdict, Wish
     from cfplan.preparation.from_programs import load_path, plan, rehearse
     from cfplan.preparation.plan_flight import PlannedFlight as Plan
     from cfplan.safety.limits_file import load_limits
@@ -46,11 +46,11 @@ __all__ = [
 ]
 
 _PLACES = {
-    "PathAnswer": ("cfplan.preparation.air_planner", "PathAnswer"),
-    "PathVerdict": ("cfplan.preparation.air_planner", "PathVerdict"),
+    "PathAnswer": ("cfplan.air.requests", "PathAnswer"),
+    "PathVerdict": ("cfplan.air.requests", "PathVerdict"),
     "Plan": ("cfplan.preparation.plan_flight", "PlannedFlight"),
     "SteeredVehicle": ("cfplan.steering.steered_vehicle", "SteeredVehicle"),
-    "Wish": ("cfplan.preparation.air_planner", "Wish"),
+    "Wish": ("cfplan.air.requests", "Wish"),
     "connect": ("cfplan.steering.connect", "connect"),
     "load_limits": ("cfplan.safety.limits_file", "load_limits"),
     "load_path": ("cfplan.preparation.from_programs", "load_path"),

@@ -9,6 +9,7 @@ from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
 
+from cfplan.air.core import PILOT_ANSWER_TIMEOUT
 from cfplan.errors import ExitCode
 from cfplan.flight.firmware import TIMEOUTS, Timeouts, version_text
 from cfplan.flight.mocap.child import FRAME_ALARM
@@ -31,7 +32,6 @@ from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, 
 from cfplan.flight.radio.connection import FIRST_ANSWER, WHOLE_CONNECTION
 from cfplan.flight.radio.perishable import KEEPS_FOR
 from cfplan.flight.setpoints.stops import DURATION as STOP_DURATION
-from cfplan.preparation.proposal_chain import PILOT_ANSWER_TIMEOUT
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.supervisor import Settings
 from cfplan.steering.steered_vehicle import PLANNER_ANSWER_TIMEOUT

@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Any
 
+from cfplan.air.stepped import PlannerFault
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase, Triple
-from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.simulation.lab.lab import Fault
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind

@@ -14,6 +14,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from cfplan.air.requests import PathAnswer, Wish
+from cfplan.air.stepped import SteppedPlanner
+from cfplan.air.timeline import Timeline, hold
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
@@ -23,11 +26,8 @@ from cfplan.flight.pilot.proposals import NO_PROPOSALS
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
 from cfplan.geometry.path_file import load_path_file
-from cfplan.preparation.air_planner import PathAnswer, Wish
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import prepare_mission
-from cfplan.preparation.replan import HeldFlight, hold
-from cfplan.preparation.stepped_planner import SteppedPlanner
 from cfplan.recording.header import RecordHeader, header_under
 from cfplan.recording.reader import read_record
 from cfplan.recording.writer import RecordWriter, new_file
@@ -142,9 +142,9 @@ class SteppedFlight:
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per fault; all fly the same mission. Raises what preparing raises."""
     limits = limits_for(settings.path_file)
-    mission, held = prepare_mission(settings.path_file, limits), prepare_held(settings.path_file, limits)
+    mission, timeline = prepare_mission(settings.path_file, limits), prepare_timeline(settings.path_file, limits)
     wanted = [row for row in SCENARIOS if not settings.only or any(text in row.name for text in settings.only)]
-    measure = partial(fly_scenario, mission=mission, held=held)
+    measure = partial(fly_scenario, mission=mission, timeline=timeline)
     return Work({scenario.name: scenario for scenario in wanted}, measure, FaultFlight)
 
 
@@ -153,19 +153,23 @@ def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
     yield table("faults", "Faults at full speed", COLUMNS, rows)
 
 
-def prepare_held(source: Path, limits: Limits) -> HeldFlight:
+def prepare_timeline(source: Path, limits: Limits) -> Timeline:
     """Plan a path file and return the flight as the in-flight planner holds it. Raises what planning raises."""
     return hold(plan_flight(source, limits).plan, load_path_file(source).waypoints)
 
 
-def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0, *, held: HeldFlight | None = None) -> FaultFlight:
-    """Fly a scenario, record it, and judge it by the truth. A planner fault needs `held`."""
+def fly_scenario(
+    scenario: Scenario, mission: Mission, seed: int = 0, *, timeline: Timeline | None = None
+) -> FaultFlight:
+    """Fly a scenario, record it, and judge it by the truth. A planner fault needs a `timeline`."""
     if scenario.planner is not None:
-        if held is None:
+        if timeline is None:
             raise InputError(
-                "no planner flies with a mission alone", where=scenario.name, hint="give what prepare_held() returns"
+                "no planner flies with a mission alone",
+                where=scenario.name,
+                hint="give what prepare_timeline() returns",
             )
-        mission = Mission(held.commitment.payloads, held.commitment.stops, mission.limits)
+        mission = Mission(timeline.commitment.payloads, timeline.commitment.stops, mission.limits)
     lab = _lab(scenario, mission, seed)
     with tempfile.TemporaryDirectory() as folder:
         writer = RecordWriter(
@@ -176,7 +180,7 @@ def fly_scenario(scenario: Scenario, mission: Mission, seed: int = 0, *, held: H
             clock=lab.clock,
         )
         with writer:
-            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab, held=held)
+            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab, timeline=timeline)
         try:
             readable = len(read_record(Path(folder)).phases.time) > 0
         except CfplanError:
@@ -191,14 +195,14 @@ def fly_stepped(
     listen: Callable[[Telemetry], None] = lambda _: None,
     seed: int = 0,
     lab: SteppedLab | None = None,
-    held: HeldFlight | None = None,
+    timeline: Timeline | None = None,
 ) -> SteppedFlight:
     """Fly a scenario in a stepped lab, by default a new one with this seed, until everything has come to rest."""
     lab = lab or _lab(scenario, mission, seed)
     orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
     planner = None
-    if scenario.planner is not None and held is not None:
-        planner = SteppedPlanner(held, mission.limits, lab.clock, flown.answers.append)
+    if scenario.planner is not None and timeline is not None:
+        planner = SteppedPlanner(timeline, mission.limits, lab.clock, flown.answers.append)
 
     def strike() -> None:
         flown.struck = lab.now

@@ -151,12 +151,10 @@ def _byte_faults(committed: Committed, limits: Limits) -> list[str]:
     before_stop = committed.stop_from - committed.splice if committed.stop_from else len(committed.payloads)
     if before_stop <= 0:
         return []  # the commitment is a stop
-    payloads = committed.payloads[:before_stop]
-    times, since, decoded = (
-        np.arange(before_stop) / RATE,
-        committed.flown.since(committed.splice / RATE),
-        decode(payloads),
-    )
+    first = 1 if committed.splice else 0  # a plan made in the air begins with the setpoint committed before
+    payloads = committed.payloads[first:before_stop]
+    times = np.arange(first, before_stop) / RATE
+    since, decoded = committed.flown.since(committed.splice / RATE), decode(payloads)
     encoded = EncodedFlight(
         times, payloads, decoded, decoded, LEAD, RATE_LEAD, THRUST_LEAD, gains_under(limits), limits.space
     )

@@ -2,7 +2,7 @@
 
 Each time a waypoint is passed, the next one is revealed and the plan is continued through it from a joint near the
 passed one, as requests in flight do. A plan always ends at rest at the last known waypoint. The reference is the plan
-through all waypoints, made before take-off.
+along the path through all waypoints that is flown soonest, made before take-off.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,13 +13,13 @@ from pathlib import Path as FilePath
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.geometry.min_snap import MIN_SPACING, centripetal_times, min_snap
+from cfplan.geometry.min_snap import MIN_SPACING
+from cfplan.geometry.path_file import path_through
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.planning.continuation import NoWayError, continue_plan
-from cfplan.planning.plan import plan
+from cfplan.planning.continuation import NoWayError, continue_plan, plan_from_rest
+from cfplan.planning.path.choice import fastest_path
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
-from cfplan.vehicle.trajectory import Trajectory
 from studies.runner.limits import limits_for
 from studies.runner.options import option
 from studies.runner.reductions import count, largest, quantile, total
@@ -91,7 +91,7 @@ def measure(case: tuple[int, int], waypoints: int, limits: Limits) -> ShortSight
     points = random_waypoints(seed, np.array([low + away, high - away]), (waypoints, waypoints))
     roomy = replace(limits, space=Space(tuple((low - ROOM).tolist()), tuple((high + ROOM).tolist()), space.margin))
     duration, stops = fly_knowing(points, known, roomy)
-    return ShortSighted(seed, known, _from_rest(points, roomy)[0].duration, duration, stops)
+    return ShortSighted(seed, known, fastest_path(path_through(points), roomy).duration, duration, stops)
 
 
 def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int]:
@@ -100,7 +100,8 @@ def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int
     `known` is the number of waypoints ahead that are known, at least 1. Where no plan can be continued, the vehicle
     comes to rest and starts again with as many. Raises a CfplanError if not even a plan from rest leads through them.
     """
-    trajectory, reached = _from_rest(points[: known + 1], limits)
+    made = plan_from_rest(points[: known + 1], limits)
+    trajectory, reached = made.plan.trajectory, made.reached
     ahead, hidden = points[1 : known + 1], points[known + 1 :]
     elapsed, stops = 0.0, 0
     while len(hidden):
@@ -117,11 +118,10 @@ def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int
             ]
             new = hidden[: max(known - len(kept), 1)]
             through = np.concatenate([ahead[kept].reshape(-1, 3), new])
-            begin = through[len(kept) - 1] if kept else here
-            onwards = centripetal_times(np.concatenate([begin[None], new]))
-            times = np.concatenate([np.diff([s, *(reached[number] for number in kept)]), onwards])
             try:
-                made = continue_plan(trajectory, passed + later, through, limits, times=times)
+                made = continue_plan(
+                    trajectory, passed + later, through, limits, reached=[reached[number] for number in kept]
+                )
             except NoWayError:
                 continue
             elapsed += passed + later
@@ -130,16 +130,10 @@ def fly_knowing(points: NDArray, known: int, limits: Limits) -> tuple[float, int
         else:
             elapsed, stops = elapsed + trajectory.duration, stops + 1
             from_rest = np.concatenate([ahead[-1:], hidden[:known]])
-            trajectory, reached = _from_rest(from_rest, limits)
+            made = plan_from_rest(from_rest, limits)
+            trajectory, reached = made.plan.trajectory, made.reached
             ahead, hidden = from_rest[1:], hidden[known:]
     return elapsed + trajectory.duration, stops
-
-
-def _from_rest(points: NDArray, limits: Limits) -> tuple[Trajectory, tuple[float, ...]]:
-    """Return the plan from rest at the first point through the others, and the path parameter s of each of those."""
-    times = centripetal_times(points)
-    planned = plan(min_snap(points, times=times), limits.airframe, limits, planner="expert")
-    return planned.trajectory, tuple(np.cumsum(times).tolist())
 
 
 def tables(settings: Settings, rows: list[ShortSighted]) -> Iterator[Table]:

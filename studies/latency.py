@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.air.requests import PathAnswer, PathVerdict, Wish
+from cfplan.air.timeline import Timeline
 from cfplan.errors import InputError
 from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.setpoints.encoding import RATE
-from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
+from cfplan.flight.setpoints.commitment import QUANTUM
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.flight.telemetry import PlanCommitted, SetpointSent, Telemetry, Triple
-from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
-from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.steps import ignore_steps
 from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import Listeners
@@ -106,7 +106,7 @@ class Stretch:
 
 DELAYS = (  # from the request
     "first changed setpoint",  # is sent
-    "change of the motion",  # at the joint
+    "changed motion",  # the first setpoint whose position is off by more than a quantum
     "answer",  # as the planner counts
 )
 PARTS = (  # of the time until the first changed setpoint, in order
@@ -129,7 +129,7 @@ class HeardSteering(RealTimeSteering):
         self.committed: list[PlanCommitted] = []
         self.heard: list[PathAnswer] = []
 
-    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+    def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:
         def hear(message: Telemetry) -> None:
             if isinstance(message, SetpointSent):
                 self.sent.setdefault(message.index, message)
@@ -141,7 +141,7 @@ class HeardSteering(RealTimeSteering):
             self.heard.append(answer)
             listeners.answer(answer)
 
-        super().start(mission, held, Listeners(hear, hear_answer))
+        super().start(mission, timeline, Listeners(hear, hear_answer))
 
 
 def work(settings: Settings, run: Run) -> Work:
@@ -205,14 +205,16 @@ class _Duration(NamedTuple):
     seconds: float
 
 
-def first_change(sequence: NDArray, splice: int, payloads: NDArray) -> int | None:
-    """Return the number of the first setpoint that `payloads`, (K, 29), change from `splice` on, or None.
+def first_changes(sequence: NDArray, splice: int, payloads: NDArray) -> tuple[int, int] | None:
+    """Return the numbers of the first setpoint that `payloads`, (K, 29), change from `splice` on, and of the first
+    whose position they change by more than a quantum; None where there are none.
 
     `sequence`, (N, 29), holds the setpoints before the change; its last one is repeated beyond its end.
     """
     before = sequence[np.minimum(np.arange(splice, splice + len(payloads)), len(sequence) - 1)]
-    changed = np.flatnonzero((before != payloads).any(axis=1))
-    return splice + int(changed[0]) if len(changed) else None
+    changed = (before != payloads).any(axis=1)
+    moved = (np.abs(decode(before).position - decode(payloads).position) > 1.5 * QUANTUM).any(axis=1)
+    return (splice + int(np.argmax(changed)), splice + int(np.argmax(moved))) if moved.any() else None
 
 
 def find_replans(flight: HeardSteering, asked: Mapping[int, float]) -> list[dict[str, float]]:
@@ -227,12 +229,11 @@ def find_replans(flight: HeardSteering, asked: Mapping[int, float]) -> list[dict
     for each in flight.committed:
         payloads = np.frombuffer(each.payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
         if (answer := answers.get(each.checksum)) is not None:
-            number, begun = first_change(sequence, each.splice, payloads), asked[answer.number]
-            if number in flight.sent:
-                sent = flight.sent[number]
-                joint = sent.due if answer.stop else sent.due + answer.joint - number / RATE
-                delays = dict(zip(DELAYS, (sent.time - begun, joint - begun, answer.seconds), strict=True))
-                found.append(delays | dict(zip(PARTS, _parts(answer, begun, sent.time), strict=True)))
+            numbers, begun = first_changes(sequence, each.splice, payloads), asked[answer.number]
+            if numbers is not None and all(number in flight.sent for number in numbers):
+                changed, moved = (flight.sent[number].time for number in numbers)
+                delays = dict(zip(DELAYS, (changed - begun, moved - begun, answer.seconds), strict=True))
+                found.append(delays | dict(zip(PARTS, _parts(answer, begun, changed), strict=True)))
         if len(sequence) < each.splice:
             waits = np.repeat(sequence[-1:], each.splice - len(sequence), axis=0)
             sequence = np.concatenate([sequence, waits])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog
-from cfplan.identification.reference import YAW, Reference
+from cfplan.identification.reference import YAW, ReferenceMotion
 from cfplan.identification.replay import Controller
 from cfplan.simulation.engine.lee import LEE_GAINS, REFERENCE_SIZE, LeeGains
 from cfplan.vehicle.airframe import GRAVITY, MOTOR_TORQUE_SIGNS
@@ -36,7 +36,7 @@ class PublicFlight:
     family: str  # vehicle and controller
     mass: float  # kg, as weighed
     log: FlightLog
-    reference: Reference
+    reference: ReferenceMotion
     controller: Controller
     source: str  # its repository
 
@@ -83,7 +83,7 @@ def read_flight(file: Path) -> PublicFlight:
         rows[:, 3 * k : 3 * k + 3] = data[f"ref_{name}"]
     rows[:, YAW] = data["ref_yaw"]
     return PublicFlight(
-        file.stem, family, float(about["mass_weighed"]), log, Reference(about["trajectory"], log.time, rows),
+        file.stem, family, float(about["mass_weighed"]), log, ReferenceMotion(about["trajectory"], log.time, rows),
         Controller(gains or MELLINGER, feeds_jerk=rates is None or bool(np.any(rates))), about["source"]["repository"],
     )  # fmt: skip
 

@@ -17,15 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from cfplan.air.certifying import STOP
+from cfplan.air.requests import PathAnswer, PathVerdict, Wish
+from cfplan.air.stepped import PlannerFault
+from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError, ExitCode, InputError
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry
-from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
-from cfplan.preparation.certified_flight import STOP
-from cfplan.preparation.replan import HeldFlight
-from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits import Limits
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.flight_in_progress import Listeners
@@ -171,7 +171,7 @@ class WatchedSteering(SteppedSteering):
         self.answered: Counter[int] = Counter()
         self._flies_plan = False
 
-    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+    def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:
         def hear(message: Telemetry) -> None:
             if isinstance(message, PhaseEntered):
                 self._flies_plan = message.phase in (Phase.STREAM, Phase.HOLD)
@@ -186,32 +186,33 @@ class WatchedSteering(SteppedSteering):
                 self.answered[answer.number] += 1
             listeners.answer(answer)
 
-        self._keep(held, 0)
-        super().start(mission, held, Listeners(hear, hear_answer))
+        self._keep(timeline, 0)
+        super().start(mission, timeline, Listeners(hear, hear_answer))
         assert self.planner is not None
-        self.planner.on_committed = lambda made: self._keep(made.held, made.proposal.splice)
+        self.planner.on_committed = lambda made: self._keep(made.timeline, made.proposal.splice)
 
-    def _keep(self, held: HeldFlight, splice: int) -> None:
+    def _keep(self, timeline: Timeline, splice: int) -> None:
         """Keep the setpoints, motion and first and last setpoints of the stops of a commitment, from its splice on.
 
         In a hover the pilot may accept a proposal at a later splice than it was made for; all of it is then delayed.
         """
-        commitment, flown = held.commitment, held.flown
+        commitment, flown = timeline.commitment, timeline.motion
         later = commitment.splices[-1] - splice if commitment.splices else 0
         if later:
             flown = flown_later(flown, splice, later)
         elif self.commitments:
             known, flown = {id(each) for each in self.commitments[-1].flown.trajectories}, self.commitments[-1].flown
-            for start, leg in zip(held.flown.starts, held.flown.trajectories, strict=True):
+            for start, leg in zip(timeline.motion.starts, timeline.motion.trajectories, strict=True):
                 if id(leg) not in known:
                     flown = flown.continued(start, leg)
         rows = slice(splice + later - commitment.first, None)
         ends = np.array(commitment.stops[rows][:, [0, -1]])
         payloads = np.array(commitment.payloads[rows])
-        if held.exact_from > 0:  # a requested stop
-            stop = splice + later, held.exact_from + later
+        if timeline.stopping:  # as was asked for
+            stop = splice + later, timeline.stops[-1][1] + later
         else:
-            stop = (0, 0) if held.stops_from is None else (held.stops_from + later, held.stops_from + STOP + later)
+            begins = timeline.part_ends
+            stop = (0, 0) if begins is None else (begins + later, begins + STOP + later)
         self.commitments.append(Committed(splice + later, payloads, ends, flown, *stop, later=later))
 
 

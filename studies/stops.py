@@ -14,6 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.air.stopping import STOPS, stop_within
+from cfplan.air.timeline import Timeline, hold
 from cfplan.errors import CfplanError
 from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
@@ -22,7 +24,6 @@ from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.replan import STOPS, HeldFlight, hold, snapshots_at, stop_within
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import fly_on
 from cfplan.simulation.link_loss import as_believed
@@ -81,24 +82,24 @@ def work(settings: Settings, run: Run) -> Work:
     """Return one case per stop, and one for the fastest plan. Raises a CfplanError if no flight can be planned."""
     limits = limits_for(Path())
     cases: dict[str, float | None] = {PLAN: None} | {f"{each:g} s": each for each in settings.durations}
-    return Work(cases, partial(measure, held=_straight_flight(limits), limits=limits), Braking)
+    return Work(cases, partial(measure, timeline=_straight_flight(limits), limits=limits), Braking)
 
 
-def measure(duration: float | None, held: HeldFlight, limits: Limits) -> Braking:
-    """Stop a held flight from full speed within a duration, s; None: brake as the fastest plan does."""
-    return _plan(limits) if duration is None else _stop(held, duration, limits)
+def measure(duration: float | None, timeline: Timeline, limits: Limits) -> Braking:
+    """Stop a flight from full speed within a duration, s; None: brake as the fastest plan does."""
+    return _plan(limits) if duration is None else _stop(timeline, duration, limits)
 
 
-def _stop(held: HeldFlight, duration: float, limits: Limits) -> Braking:
-    number, gains, space = _at_full_speed(held), gains_under(limits), limits.space
-    motion = encode_trajectory(held.flown.since(number / RATE), gains=gains, space=space).motion
+def _stop(timeline: Timeline, duration: float, limits: Limits) -> Braking:
+    number, gains, space = _at_full_speed(timeline), gains_under(limits), limits.space
+    motion = encode_trajectory(timeline.motion.since(number / RATE), gains=gains, space=space).motion
     payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
     reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
     made, _ = stop_motion(motion, _NEXT, RATE, duration)
     refused, flown = "", math.nan
     try:
-        stop = stop_within(held, number, duration, limits)
-        flown = _flown(stop.proposal.payloads, 1, held, number, limits)
+        stop = stop_within(timeline, number, duration, limits)
+        flown = _flown(stop.proposal.payloads, 1, timeline, number, limits)
     except CfplanError as error:
         refused = error.what
     return Braking(
@@ -122,7 +123,7 @@ def _plan(limits: Limits) -> Braking:
     first, last = _ends(limits)
     path = min_snap(np.linspace(first, last, 1 + round(float(np.linalg.norm(last - first)))))
     planned = plan(path, limits.airframe, limits, planner="expert", nodes=_FINE)
-    flown, held = planned.trajectory, hold(planned, np.array([first, last]))
+    flown, timeline = planned.trajectory, hold(planned, np.array([first, last]))
     times = np.arange(0.0, flown.duration, 1e-3)
     state = flown.at(times)
     speed = np.linalg.norm(state.velocity, axis=1)
@@ -135,7 +136,7 @@ def _plan(limits: Limits) -> Braking:
         speed=float(speed[begin]),
         duration=flown.duration - float(times[begin]),
         distance=_way(state.position[begin:]),
-        flown=passed + _flown(held.commitment.payloads[number:], 0, held, number, limits),
+        flown=passed + _flown(timeline.commitment.payloads[number:], 0, timeline, number, limits),
         acceleration=float(np.linalg.norm(state.acceleration[begin:], axis=1).max()),
         tilt=float(lean.max()),
         turning=float(np.linalg.norm(state.angular_acceleration[begin:], axis=1).max()),
@@ -152,26 +153,26 @@ def _ends(limits: Limits) -> NDArray:
     return ends
 
 
-def _straight_flight(limits: Limits) -> HeldFlight:
+def _straight_flight(limits: Limits) -> Timeline:
     """Return a flight along that line, from rest to rest."""
     ends = _ends(limits)
     path = min_snap(ends, times=centripetal_times(ends))
     return hold(plan(path, limits.airframe, limits, planner="expert"), ends)
 
 
-def _at_full_speed(held: HeldFlight) -> int:
+def _at_full_speed(timeline: Timeline) -> int:
     """Return the number of the setpoint where the vehicle is fastest and its speed changes least."""
-    state = held.flown.at(np.arange(0.0, held.ends, 1.0 / RATE))
+    state = timeline.motion.at(np.arange(0.0, timeline.ends, 1.0 / RATE))
     speed, acceleration = np.linalg.norm(state.velocity, axis=1), np.linalg.norm(state.acceleration, axis=1)
     return int(np.argmin(np.where(speed >= _FULL * speed.max(), acceleration, np.inf)))
 
 
-def _flown(payloads: NDArray, brakes: int, held: HeldFlight, number: int, limits: Limits) -> float:
+def _flown(payloads: NDArray, brakes: int, timeline: Timeline, number: int, limits: Limits) -> float:
     """Return the farthest distance, m, of the vehicle from payload number `brakes`, where braking begins.
 
-    The payloads replace the held setpoints from `number` on.
+    The payloads replace the committed setpoints from `number` on.
     """
-    loop = fly_on(payloads, limits.airframe, as_believed(snapshots_at(held, number), limits))
+    loop = fly_on(payloads, limits.airframe, as_believed(timeline.snapshots_at(number), limits))
     ahead = loop.position[loop.time >= brakes / RATE] - decode(payloads).position[brakes]
     return float(np.linalg.norm(ahead, axis=1).max())
 

@@ -23,6 +23,7 @@ ROOM = "tests/cli/test_virtual_in_real_time.py::test_a_second_terminal_flies_one
 MEASURED = "tests/cli/test_long_commands.py::test_what_takes_long_ends_well_in_small"
 FROM_A_CLONE = "tests/test_packaging.py::test_make_fly_in_a_new_clone_lands_and_is_never_silent_for_ten_seconds"
 PICTURES = "tests/test_pictures.py::test_make_pictures_draws_every_picture_of_the_pages"
+VALIDATED = "tests/identification/test_validate_command.py::test_a_microsd_log_is_predicted_and_its_vehicle_written"
 BY_CI = ".ci/run"
 RUN_BY = (
     (r"--help$", AS_SHOWN),
@@ -32,6 +33,7 @@ RUN_BY = (
     (r"cfplan fly", FLOWN),
     (r"cfplan (dataset|train|bench|robustness)|python -m studies", MEASURED),
     (r"cfplan (init|plan|check|sim|export|replay|report|identify|doctor)\b", AS_SHOWN),
+    (r"cfplan validate\b", VALIDATED),
     (r"eval|_CFPLAN_COMPLETE", COMPLETED),
     (r"git clone|make fly$", FROM_A_CLONE),
     (r"make pictures$", PICTURES),

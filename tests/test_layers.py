@@ -14,7 +14,7 @@ from sources import FILES, PACKAGE, STUDIES, STUDY_FILES, nodes, tree
 
 LAYERS = [
     "files", "geometry", "vehicle", "safety", "planners", "learning", "planning", "flight", "simulation",
-    "preparation", "recording", "identification", "steering", "cli",
+    "preparation", "air", "recording", "identification", "steering", "cli",
 ]  # fmt: skip
 # Modules and rooms of a package, in order: each may import those before it. Modules not named stand together.
 MODULES = "its other modules"

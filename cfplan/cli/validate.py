@@ -12,7 +12,7 @@ from cfplan.errors import ExitCode, InputError
 
 if TYPE_CHECKING:
     from cfplan.identification.logged_flight import LoggedFlight
-    from cfplan.identification.reference import Reference
+    from cfplan.identification.reference import ReferenceMotion
     from cfplan.identification.validate import Validation
 
 AIRFRAME_FILE = Path("airframe.yaml")
@@ -114,7 +114,7 @@ def _read(
     return flight_of_log(log, controller, weighed, _trajectory(polynomials, time_scale, plan), offset)
 
 
-def _trajectory(polynomials: Path | None, time_scale: float, plan: Path | None) -> "Reference | None":
+def _trajectory(polynomials: Path | None, time_scale: float, plan: Path | None) -> "ReferenceMotion | None":
     from cfplan.identification.reference import reference_of_polynomials, reference_of_trajectory
     from cfplan.planning.plan_file import load_plan
 

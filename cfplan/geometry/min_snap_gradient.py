@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.min_snap import ENERGY, HERMITE, REST, derivatives_at, solve_adjoint
+from cfplan.machine_code import njit
 
 _POWERS = np.tile(np.arange(4), 2)  # of a segment's time, by which the values at its ends scale
 
@@ -21,7 +22,7 @@ def _bases() -> NDArray:
     return np.array(bases)
 
 
-_BASES = _bases()
+BASES = _bases()
 
 
 def gradient_by_times_and_points(
@@ -32,44 +33,97 @@ def gradient_by_times_and_points(
     `by_path`, (5, 3, P), is its gradient by γ to γ'''' at the places s, (P,), along the path that pieces_through() lays
     through these points, at rest at the end. The places keep their s when the breaks between pieces move.
     """
-    count = len(times)
-    breaks = np.concatenate([[0.0], np.cumsum(times)])
-    piece = np.clip(np.searchsorted(breaks, s, side="right") - 1, 0, count - 1)
-    time = times[piece]
-    u = (s - breaks[piece]) / time
-    units = times[:, None] ** np.arange(1, 4)
-    ends = np.zeros((count, 8, 3))  # values at both ends, in units of the segment's time, from its left point on
-    ends[:, 4] = np.diff(points, axis=0)
     derivatives = derivatives_at(points, times, start, rest_end=True)
-    ends[:, 1:4], ends[:, 5:] = derivatives[:-1] * units[..., None], derivatives[1:] * units[..., None]
+    # Sums over the places of each piece: by the values at its ends, in units of its time, and by its left point; what
+    # its places contribute when they move by s, and when its time scales.
+    by_ends, by_left, moved, scaled = _sum_over_places(points, times, derivatives, s, by_path, BASES)
+    by_times, by_points = gradient_by_ends(points, times, derivatives, by_ends, by_left, start)
+    return by_times - scaled - (moved.sum() - moved.cumsum()), by_points
 
-    basis = u[:, None] ** np.arange(8) @ _BASES  # (6, P, 8)
-    path = np.einsum(
-        "kpr,pri->kip", basis, ends[piece]
-    )  # γ to γ⁽⁵⁾ in units of the segment's time, from its left point
-    weights = by_path * (time ** -np.arange(5.0)[:, None])[:, None]
-    moved = (weights * path[1:]).sum(axis=(0, 1)) / time  # by s
-    scaled = (np.arange(5)[:, None, None] * weights * path[:5]).sum(axis=(0, 1)) / time
-    by_ends, by_left = np.zeros((count, 8, 3)), np.zeros((count, 3))
-    np.add.at(by_ends, piece, np.einsum("kip,kpr->pri", weights, basis[:5]))
-    np.add.at(by_left, piece, by_path[0].T)
 
-    later = np.bincount(piece, moved, count)
-    by_times = -np.bincount(piece, scaled + u * moved, count) - (later.sum() - later.cumsum())
-    by_times += (_POWERS[:, None] * by_ends * ends).sum(axis=(1, 2)) / times
+def gradient_by_ends(
+    points: NDArray, times: NDArray, derivatives: NDArray, by_ends: NDArray, by_left: NDArray, start: NDArray | None
+) -> tuple[NDArray, NDArray]:
+    """Return the gradient by segment times, (K-1,), and points, (K, 3), of a function of the values at pieces' ends.
 
-    by_derivatives = np.zeros((len(points), 3, 3))
-    by_derivatives[:-1] += by_ends[:, 1:4] * units[..., None]
-    by_derivatives[1:] += by_ends[:, 5:] * units[..., None]
-    adjoint = solve_adjoint(points, times, by_derivatives, start, rest_end=True)
-    factors = np.zeros((count, 8, 3))  # the adjoint at both ends, in the same units
-    factors[:, 1:4], factors[:, 5:] = adjoint[:-1] * units[..., None], adjoint[1:] * units[..., None]
+    `by_ends`, (K-1, 8, 3), is its gradient by ends_of(), `by_left`, (K-1, 3), that by the left point of each piece.
+    """
+    adjoint = solve_adjoint(points, times, _by_derivatives(times, by_ends), start, rest_end=True)
+    ends, factors = ends_of(points, times, derivatives), ends_of(np.zeros_like(points), times, adjoint)
+    by_times = (_POWERS[:, None] * by_ends * ends).sum(axis=(1, 2)) / times
     stiffness = times**-7.0
     by_energy = ENERGY * (_POWERS[:, None] + _POWERS - 7)
-    by_times -= np.einsum("nri,rc,nci->n", factors, by_energy, ends) * stiffness / times
-    by_step = by_ends[:, 4] - np.einsum("nri,r->ni", factors, ENERGY[:, 4]) * stiffness[:, None]
-
+    by_times -= ((factors * (by_energy @ ends)).sum(axis=(1, 2))) * stiffness / times
+    by_step = by_ends[:, 4] - (factors * ENERGY[:, 4, None]).sum(axis=1) * stiffness[:, None]
     by_points = np.zeros_like(points)
     by_points[:-1] += by_left - by_step
     by_points[1:] += by_step
     return by_times, by_points
+
+
+def ends_of(points: NDArray, times: NDArray, derivatives: NDArray) -> NDArray:
+    """Return (K-1, 8, 3), values at both ends of each piece, in units of its time, from its left point on."""
+    units = times[:, None] ** np.arange(1, 4)
+    ends = np.zeros((len(times), 8, 3))
+    ends[:, 4] = np.diff(points, axis=0)
+    ends[:, 1:4], ends[:, 5:] = derivatives[:-1] * units[..., None], derivatives[1:] * units[..., None]
+    return ends
+
+
+def _by_derivatives(times: NDArray, by_ends: NDArray) -> NDArray:
+    """Return the gradient by γ' to γ''' at the points, (K, 3, 3), from that by the ends of pieces."""
+    units = times[:, None] ** np.arange(1, 4)
+    by_derivatives = np.zeros((len(times) + 1, 3, 3))
+    by_derivatives[:-1] += by_ends[:, 1:4] * units[..., None]
+    by_derivatives[1:] += by_ends[:, 5:] * units[..., None]
+    return by_derivatives
+
+
+@njit(error_model="numpy")
+def _sum_over_places(
+    points: NDArray, times: NDArray, derivatives: NDArray, s: NDArray, by_path: NDArray, bases: NDArray
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return the gradient by the values at both ends of each piece, (K-1, 8, 3), and by its left point, (K-1, 3).
+
+    And what the places of each piece contribute when they move by s, (K-1,), and when its time scales, (K-1,).
+    """
+    count = len(times)
+    breaks = np.zeros(count + 1)
+    for n in range(count):
+        breaks[n + 1] = breaks[n] + times[n]
+    by_ends, by_left = np.zeros((count, 8, 3)), np.zeros((count, 3))
+    moved, scaled = np.zeros(count), np.zeros(count)
+    ends, basis = np.zeros((8, 3)), np.zeros((6, 8))
+    for place in range(len(s)):
+        piece = min(max(np.searchsorted(breaks, s[place], side="right") - 1, 0), count - 1)
+        time = times[piece]
+        u = (s[place] - breaks[piece]) / time
+        for order in range(6):
+            for end in range(8):
+                value = 0.0
+                for power in range(7, -1, -1):
+                    value = value * u + bases[order, power, end]
+                basis[order, end] = value
+        for axis in range(3):
+            unit = time
+            for order in range(3):
+                ends[1 + order, axis] = derivatives[piece, order, axis] * unit
+                ends[5 + order, axis] = derivatives[piece + 1, order, axis] * unit
+                unit *= time
+            ends[4, axis] = points[piece + 1, axis] - points[piece, axis]
+            by_left[piece, axis] += by_path[0, axis, place]
+            moves = scales = 0.0
+            unit = 1.0
+            for order in range(5):
+                weight = by_path[order, axis, place] / unit
+                unit *= time
+                here = onward = 0.0
+                for end in range(8):
+                    by_ends[piece, end, axis] += weight * basis[order, end]
+                    here += basis[order, end] * ends[end, axis]
+                    onward += basis[order + 1, end] * ends[end, axis]
+                moves += weight * onward / time
+                scales += order * weight * here / time
+            moved[piece] += moves
+            scaled[piece] += scales + u * moves
+    return by_ends, by_left, moved, scaled

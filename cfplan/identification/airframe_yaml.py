@@ -24,6 +24,7 @@ _UNITS = {
     "thrust_curvature": "1 less the slope of thrust over its scale, in hover",
     "lift_with_speed": "1/(m/s)², gain of thrust",
     "voltage_sag": "1/V, fraction of thrust lost; 0 with battery compensation",
+    "motor_curve": "the firmware's cubic from V of a motor to N, and N of the full command; for logged PWM",
     "spread": "half the width of 95 %, as fractions of each value",
 }
 

@@ -18,6 +18,7 @@ from cfplan.vehicle.airframe import GRAVITY
 STATE = 13  # columns of the state
 FEWEST, SHORTEST = 200, 2.0  # records; s
 LONGEST_GAP = 0.5  # s without a record, beyond which a controller's integrals cannot be followed
+_GAP, _BESIDE = 0.03, 0.15  # s without a record; s before and behind it in which nothing counts
 _RATE = 90.0  # 1/s, records that a recomputation of the controller needs
 _FASTEST_TURN = np.radians(80.0)  # rad of tilt beyond which a vehicle has crashed
 _COMMANDS = (("thrustSI", "thrustSi"), ("torquex",), ("torquey",), ("torquez",))  # of ctrlLee, by firmware
@@ -58,6 +59,13 @@ class FlightLog:
     def attitude(self) -> Rotation:
         """Return the estimated attitude, body→world, N of them."""
         return Rotation.from_quat(self.state[:, 6:10])
+
+    def away_from_gaps(self, time: NDArray) -> NDArray:
+        """Return which times, (K,) s, are not beside a gap of the records, where nothing is known for a moment."""
+        away = np.ones(len(time), dtype=bool)
+        for k in np.flatnonzero(self.gaps > _GAP):
+            away &= (time < self.time[k] - _BESIDE) | (time > self.time[k + 1] + _BESIDE)
+        return away
 
     def between(self, begin: float, end: float) -> "FlightLog":
         """Return the part from one time to another, s; its times count from its first record.
@@ -140,7 +148,7 @@ def read_microsd(file: Path) -> FlightLog:
         acceleration=_columns(table, "acc", "xyz", GRAVITY),
         voltage=table.get("pm.vbat"),
         setpoint=_columns(table, "ctrltargetZ", ("x", "y", "z", "vx", "vy", "vz"), 1e-3),
-        setpoint_yaw=table.get("ctrlLee.rpydz"),
+        setpoint_yaw=_desired_yaw(table),
         pose_time=pose_time,
         poses=poses,
     )
@@ -164,6 +172,15 @@ def _attitude(table: Mapping[str, NDArray]) -> NDArray | None:
             if np.isfinite(found).all():
                 return found
     return None
+
+
+def _desired_yaw(table: Mapping[str, NDArray]) -> NDArray | None:
+    """Return the yaw of the setpoint, (N,) rad: the desired attitude's y axis is across it, whatever its tilt."""
+    angles = _columns(table, "ctrlLee", ("rpydz", "rpydy", "rpydx"))
+    if angles is None:
+        return None
+    left = Rotation.from_euler("ZYX", angles).as_matrix()[:, :, 1]
+    return np.asarray(np.arctan2(-left[:, 0], left[:, 1]))
 
 
 def _rates(table: Mapping[str, NDArray]) -> NDArray | None:

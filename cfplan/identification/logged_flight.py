@@ -10,7 +10,7 @@ from cfplan.errors import InputError
 from cfplan.flight.firmware import gains_for
 from cfplan.flight.pilot.vehicle_rules import EXTERNAL_ATTITUDE_STD, EXTERNAL_POSITION_STD
 from cfplan.identification.flight_log import FlightLog
-from cfplan.identification.reference import Reference, reference_of_setpoints
+from cfplan.identification.reference import ReferenceMotion, reference_of_setpoints
 from cfplan.identification.replay import Controller, find_start
 from cfplan.identification.signals import FlightSignals, read_signals
 from cfplan.identification.validate import poses_of
@@ -30,7 +30,7 @@ class LoggedFlight:
     """A flight with everything that predicting it takes."""
 
     log: FlightLog
-    reference: Reference
+    reference: ReferenceMotion
     controller: Controller
     airframe: Airframe  # that it was planned with, or of its kind
     poses: EstimatorInput
@@ -75,7 +75,7 @@ def flight_of_record(record: Record, begin: float = 0.0, end: float = math.inf) 
 
 
 def flight_of_log(
-    log: FlightLog, controller: Controller, airframe: Airframe, reference: Reference | None = None,
+    log: FlightLog, controller: Controller, airframe: Airframe, reference: ReferenceMotion | None = None,
     offset: Triple | None = None,
 ) -> LoggedFlight:  # fmt: skip
     """Return the flight of a log along a reference whose start is not known, or else along the logged setpoints.
@@ -94,7 +94,7 @@ def flight_of_log(
     return LoggedFlight(log, begun, controller, airframe, poses_of(log))
 
 
-def _reference(record: Record, zero: float) -> Reference:
+def _reference(record: Record, zero: float) -> ReferenceMotion:
     """Return the motion that was meant, with the setpoints as sent."""
     sent, time = record.setpoints, record.setpoints.time - zero
     attitude, acceleration, _ = meant_motion(sent)
@@ -103,7 +103,7 @@ def _reference(record: Record, zero: float) -> Reference:
     rows = np.zeros((len(sent.time), SETPOINT_SIZE))
     rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = sent.position, sent.velocity, sent.acceleration
     rows[:, 9:13], rows[:, 13:16] = sent.quaternion, sent.body_rate
-    return Reference("setpoints as sent", motion.time, motion.rows, time + LINK_DELAY, rows)
+    return ReferenceMotion("setpoints as sent", motion.time, motion.rows, time + LINK_DELAY, rows)
 
 
 def _late_by(signals: FlightSignals) -> float:

@@ -20,7 +20,6 @@ HOVER = 1.0  # s from the first record in which the thrust scale is measured
 _PERIOD = 0.002  # s, of the grid that columns are smoothed on
 _SMOOTHING = 0.012  # s
 _CLIMB_SMOOTHING = 0.030  # s, before the climb is differentiated
-_GAP = 0.03  # s without a record, around which nothing is measured
 _LAGS = np.arange(0.025, 0.125, 0.005)  # s, of the motors
 _FASTEST = 0.35  # m/s in body axes that a flight must reach for a moment or a drag to show
 _LEAST_FIT = 0.85  # fraction of the torque's variance that moment and inertia must explain
@@ -158,9 +157,7 @@ def _smoothed(log: FlightLog) -> _Smooth:
     def smooth(values: NDArray) -> NDArray:
         return np.asarray(gaussian_filter1d(on_grid(values), _SMOOTHING / _PERIOD, axis=0))
 
-    keep = (grid > 0.2) & (grid < log.duration - 0.2)
-    for k in np.flatnonzero(log.gaps > _GAP):
-        keep &= (grid < log.time[k] - 0.15) | (grid > log.time[k + 1] + 0.15)
+    keep = (grid > 0.2) & (grid < log.duration - 0.2) & log.away_from_gaps(grid)
     velocity = smooth(log.body_velocity)
     if _has_poses(log):
         velocity[:, :2] = _seen_velocity(log, grid)

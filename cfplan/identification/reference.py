@@ -21,7 +21,7 @@ _SMOOTHING = 0.20  # s, over which logged setpoints, a staircase of 10 ms and 1 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class ReferenceMotion:
     """A motion sampled densely: before its start and after its end it rests."""
 
     source: str
@@ -38,7 +38,7 @@ class Reference:
         rows[np.ix_(rests, [*range(3, YAW), YAW + 1])] = 0.0
         return rows
 
-    def moved(self, start: float, offset: NDArray) -> "Reference":
+    def moved(self, start: float, offset: NDArray) -> "ReferenceMotion":
         """Return the reference begun `start` s later, `offset` (3,) m farther."""
         rows = self.rows.copy()
         rows[:, POSITION] += offset
@@ -49,10 +49,11 @@ class Reference:
         return self.sent[np.searchsorted(self.sent_time, time, side="right").clip(1) - 1]
 
 
-def reference_of_polynomials(file: Path, time_scale: float = 1.0) -> Reference:
+def reference_of_polynomials(file: Path, time_scale: float = 1.0) -> ReferenceMotion:
     """Return the motion of a polynomial file of Crazyswarm, `time_scale` times as long. Raises InputError."""
     if not time_scale > 0.0:
-        raise InputError(f"the time scale must be positive, not {time_scale:g}", where=str(file))
+        hint = "0.5 flies the polynomials in half their time"
+        raise InputError(f"the time scale must be positive, not {time_scale:g}", where=str(file), hint=hint)
     durations, table = read_polynomial_rows(file)
     ends = np.cumsum(durations)
     time = np.arange(0.0, ends[-1] * time_scale + _STEP, _STEP)
@@ -69,10 +70,10 @@ def reference_of_polynomials(file: Path, time_scale: float = 1.0) -> Reference:
         rows[:, 3 * order : 3 * order + 3] = values[:, :3]
         if order < 2:
             rows[:, YAW + order] = values[:, 3]
-    return Reference(file.name, time, rows)
+    return ReferenceMotion(file.name, time, rows)
 
 
-def reference_of_trajectory(trajectory: Trajectory, name: str) -> Reference:
+def reference_of_trajectory(trajectory: Trajectory, name: str) -> ReferenceMotion:
     """Return the motion of a plan."""
     time = np.arange(0.0, trajectory.duration + _STEP, _STEP)
     state = trajectory.at(np.minimum(time, trajectory.duration))
@@ -81,10 +82,10 @@ def reference_of_trajectory(trajectory: Trajectory, name: str) -> Reference:
     rows[:, 9:12] = np.gradient(state.acceleration, time, axis=0)
     rows[:, YAW] = np.unwrap(state.yaw)
     rows[:, YAW + 1] = np.gradient(rows[:, YAW], time)
-    return Reference(name, time, rows)
+    return ReferenceMotion(name, time, rows)
 
 
-def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None = None) -> Reference:
+def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None = None) -> ReferenceMotion:
     """Return the motion of logged setpoints: position, velocity, and acceleration where logged, (N, 6 or 9); yaw (N,).
 
     A vehicle logs them as a staircase, so each stands for the middle of the time that it holds. What is not logged is
@@ -103,5 +104,5 @@ def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None
     rows[:, 9:12] = smooth(rows[:, 6:9], 1)
     if yaw is not None:
         rows[:, YAW] = np.interp(grid, time, np.unwrap(yaw))
-        rows[:, YAW + 1] = np.gradient(rows[:, YAW], grid)
-    return Reference("logged setpoints", grid, rows)
+        rows[:, YAW + 1] = smooth(rows[:, YAW], 1)
+    return ReferenceMotion("logged setpoints", grid, rows)

@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from cfplan.errors import InputError
 from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog
-from cfplan.identification.reference import POSITION, YAW, Reference
+from cfplan.identification.reference import POSITION, YAW, ReferenceMotion
 from cfplan.machine_code import njit
 from cfplan.simulation.engine import layout, lee
 from cfplan.simulation.engine.layout import MEMORY, SETPOINT, SETPOINT_SIZE, VEHICLE_SIZE
@@ -23,7 +23,8 @@ from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD, Modes, step
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 LEAST_EXPLAINED = 0.95  # fraction of the commands' variance
-_LEAST_VARIED = 0.01  # of the weight, N, and of the weight times the arm, N m: commands that vary less show nothing
+# Of the weight, N, and of the weight times the arm, N m: what varies less, as in hover, is mostly the log's rounding.
+_LEAST_VARIED = np.array([0.010, 0.015, 0.015, 0.015])
 _SMOOTHING = 0.008  # s, of both: records of state and command are not of the same control step
 _SEARCHED = 0.5  # s, half the range in which the start is searched for finely
 _COARSE, _FINE = 0.020, 0.001  # s
@@ -57,7 +58,7 @@ class Controller:
         """Return whether it is Lee's."""
         return isinstance(self.gains, LeeGains)
 
-    def setpoints(self, reference: Reference, time: NDArray) -> NDArray:
+    def setpoints(self, reference: ReferenceMotion, time: NDArray) -> NDArray:
         """Return what it is given at these times, (N, 14) of Lee's or (N, 20) of Mellinger's."""
         if not self.by_lee and len(reference.sent):
             return reference.sent_at(time)
@@ -87,7 +88,7 @@ class Recomputed:
         return float(np.nanmin([self.thrust, self.torque]))
 
 
-def recompute(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
+def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Recomputed:
     """Return the commands that a controller gives for the logged state. Raises InputError where none were logged."""
     gains, setpoints = controller.gains.pack(), controller.setpoints(reference, log.time)
     size = lee.MEMORY_SIZE if controller.by_lee else layout.MEMORY_SIZE
@@ -97,7 +98,8 @@ def recompute(log: FlightLog, reference: Reference, controller: Controller, airf
     mode = FULL_STATE if len(reference.sent) else ON_BOARD
     weight = controller.gains.mass * GRAVITY
     least = _LEAST_VARIED * weight * np.array([1.0, airframe.arm, airframe.arm, airframe.arm])
-    spread = np.maximum(np.std(gaussian_filter1d(logged, width, axis=0), axis=0), least)
+    counts = log.away_from_gaps(log.time)
+    spread = np.maximum(np.std(gaussian_filter1d(logged, width, axis=0)[counts], axis=0), least)
     known = np.isfinite(spread)
     if not known.any():
         hint = "log ctrlLee.thrustSI and .torquex to .torquez, or motor.m1 to .m4 with pm.vbat"
@@ -117,14 +119,18 @@ def recompute(log: FlightLog, reference: Reference, controller: Controller, airf
         slopes = np.column_stack([unexplained(memory[free] + each) - now for each in step]) / np.diag(step)
         memory[free] -= np.linalg.lstsq(slopes, now, rcond=_LEAST_KNOWN)[0]
     unexplained(memory[free])
-    left = np.var(gaussian_filter1d(control - logged, width, axis=0), axis=0)
+    left = np.var(gaussian_filter1d(control - logged, width, axis=0)[counts], axis=0)
     thrust, torque = 1.0 - left[0] / spread[0] ** 2, 1.0 - left[1:3].sum() / (spread[1:3] ** 2).sum()
     return Recomputed(control, memory, float(thrust), float(torque))
 
 
 def find_start(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, offset: NDArray | None = None
-) -> Reference:
+    log: FlightLog,
+    reference: ReferenceMotion,
+    controller: Controller,
+    airframe: Airframe,
+    offset: NDArray | None = None,
+) -> ReferenceMotion:
     """Return the reference begun when it was flown: where it explains the commands best.
 
     A logged setpoint shows start and place directly. Else `offset`, (3,) m, is the place of its origin; without it x
@@ -146,8 +152,8 @@ def find_start(
 
 
 def refine_start(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, search: float = _COARSE
-) -> Reference:
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe, search: float = _COARSE
+) -> ReferenceMotion:
     """Return the reference begun up to `search` s sooner or later, where it explains the torque best."""
 
     def unexplained(later: float) -> float:
@@ -160,7 +166,7 @@ def refine_start(
     return reference.moved(float(fine.x), np.zeros(3))
 
 
-def choose_jerk(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Controller:
+def choose_jerk(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Controller:
     """Return the controller, or where only that explains the torque, the one whose firmware feeds jerk otherwise."""
     if not controller.by_lee or recompute(log, reference, controller, airframe).torque >= LEAST_EXPLAINED:
         return controller
@@ -168,7 +174,9 @@ def choose_jerk(log: FlightLog, reference: Reference, controller: Controller, ai
     return other if recompute(log, reference, other, airframe).torque >= LEAST_EXPLAINED else controller
 
 
-def check_explained(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> Recomputed:
+def check_explained(
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
+) -> Recomputed:
     """Return the recomputed commands. Raises InputError where they explain too little, naming the likely gain."""
     found = recompute(log, reference, controller, airframe)
     if found.explained >= LEAST_EXPLAINED:
@@ -187,7 +195,9 @@ def check_explained(log: FlightLog, reference: Reference, controller: Controller
     )
 
 
-def likely_cause(log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe) -> tuple[str, float]:
+def likely_cause(
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
+) -> tuple[str, float]:
     """Return the start or the one gain that explains most if changed, as text, and the fraction explained then."""
     moved = refine_start(log, reference, controller, airframe, _SEARCHED)
     best = recompute(log, moved, controller, airframe).explained
@@ -235,10 +245,10 @@ def _integral_gains(gains: LeeGains | MellingerGains) -> tuple[float, ...]:
     return gains.ki_xy, gains.ki_xy, gains.ki_z, gains.ki_m_xy, gains.ki_m_xy, gains.ki_m_z
 
 
-def _found_by_setpoints(log: FlightLog, reference: Reference, setpoint: NDArray) -> Reference:
+def _found_by_setpoints(log: FlightLog, reference: ReferenceMotion, setpoint: NDArray) -> ReferenceMotion:
     """Return the reference moved in time and place onto the logged setpoints."""
 
-    def moved(start: float) -> tuple[Reference, float]:
+    def moved(start: float) -> tuple[ReferenceMotion, float]:
         begun = reference.moved(start, np.zeros(3))
         rows = begun.at(log.time)
         offset = np.median(setpoint[:, :3] - rows[:, POSITION], axis=0)
@@ -251,7 +261,7 @@ def _found_by_setpoints(log: FlightLog, reference: Reference, setpoint: NDArray)
     return moved(float(min(fine, key=lambda start: moved(float(start))[1])))[0]
 
 
-def _apart(log: FlightLog, reference: Reference) -> float:
+def _apart(log: FlightLog, reference: ReferenceMotion) -> float:
     """Return the mean squared distance in x and y of the estimate from a reference, at every tenth record, m²."""
     off = reference.at(log.time[::10])[:, :2] - log.state[::10, :2]
     return float(np.mean((off - off.mean(axis=0)) ** 2))

@@ -9,8 +9,8 @@ from cfplan.errors import InputError
 from cfplan.flight.telemetry import Phase
 from cfplan.recording.record import Estimates, Poses, Record, Setpoints, StatusReports
 from cfplan.vehicle.airframe import Airframe
+from cfplan.vehicle.motor_commands import command_shares
 
-_FULL_COMMAND = 65535  # of one motor, 16 bits
 SHORTEST = 5.0  # s of flight that say anything
 _BEGINS = (Phase.GO_TO_START, Phase.STREAM)
 _ENDS = (Phase.LAND, Phase.DISARM, Phase.CLOSED)
@@ -62,7 +62,7 @@ def read_signals(record: Record) -> FlightSignals:
                 where=where,
                 hint="use a record of `cfplan fly`, with motion capture and the vehicle's logs",
             )
-    command = status["motor"] / _FULL_COMMAND
+    command = command_shares(status["motor"], status["battery_voltage"], record.header.vehicle)
     if not command.any() or len(setpoints["time"]) < 20:
         raise InputError("it holds no motor commands or no setpoints", where=where, hint="use a record of `cfplan fly`")
     end = min(end, *(float(stream["time"][-1]) for stream in (status, poses, estimates)))

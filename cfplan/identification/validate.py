@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cfplan.flight.firmware import MellingerGains
 from cfplan.identification.flight_log import FlightLog, check_log
 from cfplan.identification.measured import Measured, measure, scale_by_voltage
-from cfplan.identification.reference import POSITION, SETPOINT_PERIOD, Reference
+from cfplan.identification.reference import POSITION, SETPOINT_PERIOD, ReferenceMotion
 from cfplan.identification.replay import Controller, Recomputed, check_explained, choose_jerk
 from cfplan.simulation.engine.estimated_loop import POSE_LATENCY, EstimatorInput, fly_with_estimator
 from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD
@@ -60,7 +60,7 @@ class Validation:
     """One flight, predicted."""
 
     log: FlightLog
-    reference: Reference
+    reference: ReferenceMotion
     controller: Controller
     recomputed: Recomputed
     measured: Measured
@@ -71,7 +71,7 @@ class Validation:
 
 def validate(
     log: FlightLog,
-    reference: Reference,
+    reference: ReferenceMotion,
     controller: Controller,
     airframe: Airframe,
     poses: EstimatorInput | None = None,
@@ -117,7 +117,7 @@ def poses_of(log: FlightLog, latency: float = POSE_LATENCY) -> EstimatorInput:
 
 
 def predict(
-    log: FlightLog, reference: Reference, controller: Controller, airframe: Airframe, recomputed: Recomputed,
+    log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe, recomputed: Recomputed,
     poses: EstimatorInput, *, estimator: bool = True,
 ) -> NDArray:  # fmt: skip
     """Return where a vehicle of this airframe believes to be at each record, (N, 3) m."""
@@ -136,7 +136,7 @@ def predict(
     return flown.beliefs[at][:, POSITION]
 
 
-def compare(log: FlightLog, reference: Reference, predicted: NDArray) -> Comparison:
+def compare(log: FlightLog, reference: ReferenceMotion, predicted: NDArray) -> Comparison:
     """Compare predicted with estimated positions, (N, 3) m, both less the reference."""
     wanted = reference.at(log.time)[:, POSITION]
     measured, foreseen = log.state[:, POSITION] - wanted, predicted - wanted

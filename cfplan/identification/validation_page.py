@@ -14,6 +14,7 @@ from cfplan.recording.report.page import html_page, html_table
 from cfplan.version import __version__
 
 _CENTIMETRES = 100.0
+_NOISE = 0.02  # m of measured rms, below which noise of poses and sensors is as large as what is predicted
 
 
 def comparison_rows(found: Comparison) -> list[tuple[str, str, str, str]]:
@@ -59,7 +60,8 @@ def verdict(validation: Validation) -> str:
     found = validation.comparison
     agreed = f"rms {found.ratio:.2f} and largest {found.largest_ratio:.2f} of the measured"
     holds = "holds" if found.passes else "does not hold"
-    return f"{holds}: {agreed}, correlation {found.correlation:.3f}"
+    noise = "" if found.passes or found.measured_rms > _NOISE else "; a deviation so small is mostly noise"
+    return f"{holds}: {agreed}, correlation {found.correlation:.3f}{noise}"
 
 
 def validation_to_dict(validation: Validation) -> dict[str, Any]:

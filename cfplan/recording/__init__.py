@@ -8,6 +8,7 @@ __all__ = [
     "importers",
     "mavlink",
     "overlay",
+    "plots",
     "public_topics",
     "reader",
     "record",

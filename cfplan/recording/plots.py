@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cfplan.flight.telemetry import Phase
 from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.summary import deviation, reference_span
+from cfplan.vehicle.motor_commands import command_shares
 
-FULL_COMMAND = 65535  # of a motor, 16 bits
 FAR_LIMIT = 2.0  # times the measured span beyond it, from which on a limit is not drawn
 
 Colour = tuple[int, int, int]
@@ -119,8 +119,9 @@ def _along_the_path(record: Record) -> tuple[float, float]:
 
 
 def motor_thrust(record: Record) -> NDArray:
-    """Return (N, 4) N, from the 16-bit commands of the status messages."""
-    return record.status.motor / FULL_COMMAND * record.header.thrust_at_full_command
+    """Return (N, 4) N that the controller asked for, from the motors' PWM in the status messages."""
+    status, header = record.status, record.header
+    return command_shares(status.motor, status.battery_voltage, header.vehicle) * header.thrust_at_full_command
 
 
 def pose_age(record: Record) -> tuple[NDArray, NDArray]:

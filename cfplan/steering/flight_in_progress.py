@@ -4,14 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from cfplan.air.requests import PathAnswer, Wish
+from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import Clock
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.telemetry import Telemetry, Triple
-from cfplan.preparation.air_planner import PathAnswer, Wish
-from cfplan.preparation.replan import HeldFlight
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,8 +34,8 @@ class FlightInProgress(Protocol):
     def first_pose(self) -> tuple[Triple, float]:
         """Return where the vehicle stands, m, and its yaw, rad, before the flight. Raises a CfplanError."""
 
-    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
-        """Fly a mission from now on; `held` is what it was made from. Returns at once."""
+    def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:
+        """Fly a mission from now on; `timeline` is what it was made from. Returns at once."""
 
     def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
         """Ask the planner for a change; return the number of the answer."""

@@ -7,6 +7,9 @@ import types
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from cfplan.air.process import AirPlanner
+from cfplan.air.requests import PathAnswer, PathVerdict, Wish
+from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.mocap.poses import PoseSource
@@ -15,9 +18,6 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry, Triple
-from cfplan.preparation.air_planner import PathAnswer, PathVerdict, Wish
-from cfplan.preparation.planner_process import AirPlanner
-from cfplan.preparation.replan import HeldFlight
 from cfplan.preparation.steps import OnStep
 from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import Listeners
@@ -75,9 +75,9 @@ class RealTimeSteering:
             self._source.close()
         return pose.position, yaw_of(pose.quaternion)
 
-    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
+    def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:
         with main_module_hidden():
-            self.planner = self._open.enter_context(AirPlanner(held, mission.limits, self._vehicle.pilot.proposals))
+            self.planner = self._open.enter_context(AirPlanner(timeline, mission.limits, self._vehicle.pilot.proposals))
         self._thread = threading.Thread(target=self._fly, args=(mission, listeners), name="flight")
         self._thread.start()
         threading.Thread(target=self._hear_planner, args=(listeners,), name="planner's answers", daemon=True).start()

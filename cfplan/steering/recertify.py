@@ -6,38 +6,26 @@ be those that the pilot verified, to the byte, and each setpoint streamed the on
 committed in parts, each part is.
 """
 
-from collections import defaultdict, deque
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.air.certifying import BEHIND, Onward, certify_beginning, certify_whole
+from cfplan.air.stopping import STOPS, stop_within
+from cfplan.air.timeline import Replanned, Timeline, hold, hold_hover, joint_of
 from cfplan.errors import CfplanError, InputError, NotCertifiedError
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, checksum_of
-from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
+from cfplan.flight.setpoints.commitment import propose, spliced
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
-from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import Phase
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.certified_flight import BEHIND, certify_beginning, certify_whole
-from cfplan.preparation.replan import (
-    STOPS,
-    HeldFlight,
-    at_rest_from,
-    held_with,
-    hold,
-    hold_hover,
-    snapshots_at,
-    stop_within,
-)
 from cfplan.recording.commitments import committed_setpoints
 from cfplan.recording.record import PLAN_FILE, PLAN_IN_FLIGHT, Record
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
-from cfplan.vehicle.joint import JoinedTrajectory
 
 YAW = "yaw"  # rad, in the provenance of a header: that of the hover in which a steered flight begins
 _SAME = 1e-6  # m, m/s, m/s², m/s³, that a motion may jump by at a joint
@@ -83,7 +71,7 @@ def recertify(record: Record) -> Recertified:
     """
     commitments = record.commitments
     plans = [_plan_of(record, int(checksum)) for checksum in commitments.checksum[1:]]
-    held, first = _beginning(record, plans)
+    timeline, first = _beginning(record, plans)
     found = [plan.certificate for plan in (first, *plans) if plan is not None]
     for number, certificate in enumerate(found, 1):
         if not certificate.passed:
@@ -94,37 +82,24 @@ def recertify(record: Record) -> Recertified:
                 hint="the record was changed since, or made by another version",
             )
     limits = next(plan.limits for plan in (first, *plans) if plan is not None)
-    joints = _joints_told(record)
-    jump, stops, setpoints = 0.0, 0, len(held.commitment.payloads)
+    jump, stops, setpoints = 0.0, 0, len(timeline.commitment.payloads)
     for number, plan in enumerate(plans, 1):
         splice = int(commitments.splice[number])
-        joint = (splice + SPLICE_AHEAD) / RATE
         if plan is not None:
-            joint = joints[splice].popleft() if joints[splice] else joint
-            resting = at_rest_from(held, round(joint * RATE) - SPLICE_AHEAD, limits)
-            jump, limits = max(jump, _jump(resting, splice, joint, plan)), plan.limits
+            jump = max(jump, _jump(timeline.for_plans_from(splice, limits), joint_of(splice), plan))
+            limits = plan.limits
         told, checksum = commitments.payloads[number], int(commitments.checksum[number])
-        held = _committed(held, splice, joint, plan, limits, told, checksum, number)
-        stops += held.exact_from > 0
+        made = _committed(timeline, splice, plan, limits, told, checksum, number)
+        begins = int(commitments.splice[number:].min())  # what is before that setpoint is left by no other plan
+        timeline = made.accepted(spliced(timeline.commitment, made.proposal, begins))
+        stops += timeline.stopping
         setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
-    sequence = committed_setpoints(record) if len(commitments.time) else held.commitment.payloads
+    sequence = committed_setpoints(record) if len(commitments.time) else timeline.commitment.payloads
     streamed, left_after = _compare(record, sequence)
     certificates = sorted(found, key=lambda certificate: certificate.worst.share)
     worst_of_all = certificates[-1] if certificates else None
     count = sum(plan is not None for plan in plans)
     return Recertified(len(found), stops, worst_of_all, count, jump, setpoints, streamed, left_after)
-
-
-def _joints_told(record: Record) -> defaultdict[int, deque[float]]:
-    """Return the joints of the plans that were answered, s, by the splices of their proposals, in order.
-
-    A plan may replace another, or a stop, from the same splice on. A stop has its joint there.
-    """
-    joints: defaultdict[int, deque[float]] = defaultdict(deque)
-    for splice, joint in zip(record.answers.splice.tolist(), record.answers.joint.tolist(), strict=True):
-        if joint > splice / RATE:
-            joints[splice].append(joint)
-    return joints
 
 
 def _plan_of(record: Record, checksum: int) -> Plan | None:
@@ -133,8 +108,8 @@ def _plan_of(record: Record, checksum: int) -> Plan | None:
     return load_plan(file) if file.is_file() else None
 
 
-def _beginning(record: Record, plans: list[Plan | None]) -> tuple[HeldFlight, Plan | None]:
-    """Return what was held before anything was asked for, and the plan behind it; None for a hover."""
+def _beginning(record: Record, plans: list[Plan | None]) -> tuple[Timeline, Plan | None]:
+    """Return the timeline before anything was asked for, and the plan behind it; None for a hover."""
     if (record.folder / PLAN_FILE).is_file():
         first = load_plan(record.folder / PLAN_FILE)
         ends = first.path(np.array([0.0, first.path.end]))
@@ -151,9 +126,9 @@ def _beginning(record: Record, plans: list[Plan | None]) -> tuple[HeldFlight, Pl
     return hold_hover((x, y, z), yaw, first_made.limits), None
 
 
-def _jump(held: HeldFlight, splice: int, joint: float, plan: Plan) -> float:
+def _jump(timeline: Timeline, joint: float, plan: Plan) -> float:
     """Return by how much position to jerk jump at a joint, s. Raises NotCertifiedError where they do."""
-    before, after = held.flown.at(joint), plan.trajectory.at(0.0)
+    before, after = timeline.motion.at(joint), plan.trajectory.at(0.0)
     jumps = [
         float(np.abs(getattr(after, name) - getattr(before, name)).max())
         for name in ("position", "velocity", "acceleration", "jerk")
@@ -161,67 +136,60 @@ def _jump(held: HeldFlight, splice: int, joint: float, plan: Plan) -> float:
     if max(jumps) > _SAME:
         raise NotCertifiedError(
             f"the motion jumps by {max(jumps):.2g} at {joint:.2f} s",
-            where=f"the joint behind setpoint {splice}",
+            where="a joint",
             hint="the record was changed since, or made by another version",
         )
     return max(jumps)
 
 
 def _committed(
-    held: HeldFlight,
-    splice: int,
-    joint: float,
-    plan: Plan | None,
-    limits: Limits,
-    payloads: bytes,
-    checksum: int,
-    number: int,
-) -> HeldFlight:
-    """Certify a plan again, or another part of it, and return what was held with that.
+    timeline: Timeline, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, checksum: int, number: int
+) -> Replanned:
+    """Certify a plan again, or another part of it, and return it.
 
     Raises NotCertifiedError where it is something else.
     """
     where = f"plan {number}, from setpoint {splice} on"
     told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
-    begin = splice if plan is None else round(joint * RATE) - SPLICE_AHEAD  # before it all is as committed before
-    held, flown = at_rest_from(held, begin, limits), held.flown
+    timeline = timeline.for_plans_from(splice, limits)
+    motion = timeline.motion
     if plan is not None:
-        flown = held.flown.continued(joint, plan.trajectory)
-    elif held.stops_from is None or not _goes_on(flown, splice, told, limits):
-        return _stopped(held, splice, told, checksum, where, limits)
-    since, starts, equal = flown.since(begin / RATE), snapshots_at(held, begin), splice - begin
+        motion = motion.continued(joint_of(splice), plan.trajectory)
+    onward = timeline.onward(splice, motion)
+    if plan is None and (timeline.part_ends is None or not _goes_on(onward, told, limits)):
+        return _stopped(timeline, splice, told, checksum, where, limits)
     try:
-        if len(told) + equal == len(encode_trajectory(since, gains=gains_under(limits), space=limits.space).payloads):
-            made = certify_whole(since, limits, starts)
+        if len(told) == len(onward.encoded(limits).payloads):
+            made = certify_whole(onward, limits)
         else:
-            made = certify_beginning(since, len(told) + equal - BEHIND, limits, starts, foresee=False)
+            made = certify_beginning(onward, len(told) - BEHIND, limits, foresee=False)
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
-    certified, stops = made.payloads[equal:], made.stops[equal:]
-    if told.shape != certified.shape or (told != certified).any():
+    if told.shape != made.payloads.shape or (told != made.payloads).any():
         raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
-    if checksum_of(splice, certified, stops) != checksum:
+    proposal = propose(timeline.commitment, splice, made.payloads, made.stops, made.ending)
+    if proposal.checksum != checksum:
         raise NotCertifiedError("the stops are not those that were verified", where=where, hint="was it changed?")
-    with_it = held_with(replace(held, flown=flown), begin, made)
-    return replace(with_it, commitment=Commitment(splice, certified, stops))
+    later = replace(timeline, motion=motion).with_certified(splice, made)
+    return Replanned(proposal, later, plan, joint_of(splice))
 
 
-def _goes_on(flown: JoinedTrajectory, splice: int, told: NDArray, limits: Limits) -> bool:
+def _goes_on(onward: Onward, told: NDArray, limits: Limits) -> bool:
     """Return whether setpoints are more of the plan that is flown, and no stop."""
-    encoded = encode_trajectory(flown.since(splice / RATE), gains=gains_under(limits), space=limits.space)
+    payloads = onward.encoded(limits).payloads
     following = len(told) - BEHIND
     if following < 2:  # a stop is as long, and begins like the plan; what is left of a plan is all of it
-        return np.array_equal(told, encoded.payloads)
-    return np.array_equal(told[:following], encoded.payloads[:following])
+        return np.array_equal(told, payloads)
+    return np.array_equal(told[:following], payloads[:following])
 
 
-def _stopped(held: HeldFlight, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> HeldFlight:
-    """Return what was held with a stop that was asked for, certified again. Raises InputError where there is none."""
+def _stopped(timeline: Timeline, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> Replanned:
+    """Return a stop that was asked for, certified again. Raises InputError where there is none."""
     for duration in STOPS:
         with suppress(CfplanError):
-            made = stop_within(held, splice, duration, limits)
+            made = stop_within(timeline, splice, duration, limits)
             if made.proposal.checksum == checksum and np.array_equal(made.proposal.payloads, told):
-                return made.held
+                return made
     raise InputError(
         "there is no such file with its plan, and it is no certified stop either",
         where=where,

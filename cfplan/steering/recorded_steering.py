@@ -6,6 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from cfplan.air.requests import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -13,7 +14,6 @@ from cfplan.flight.telemetry import Event, Level, PathAnswered, PathRequested, T
 from cfplan.identification.advice import suggests_identification
 from cfplan.numbers import coordinates
 from cfplan.planning.plan_file import save_plan
-from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.recording.header import RecordHeader, header_of_steering
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_IN_FLIGHT, Record

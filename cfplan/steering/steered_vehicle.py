@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cfplan.air.requests import PathAnswer, PathRequest, PathVerdict, Wish
+from cfplan.air.timeline import hold_hover
 from cfplan.errors import (
     CfplanError,
     ExitCode,
@@ -30,8 +32,6 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, SetpointSent, Telemetry, Triple
-from cfplan.preparation.air_planner import PathAnswer, PathRequest, PathVerdict, Wish
-from cfplan.preparation.replan import hold_hover
 from cfplan.recording.record import Record
 from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
@@ -141,10 +141,10 @@ class SteeredVehicle:
                 raise InputError(f"{height!r} is no height", where="take_off", hint="give metres above the origin")
             limits = replace(limits, ground=replace(limits.ground, take_off_height=float(height)))
         (x, y, _), yaw = self._flight.first_pose()
-        held = hold_hover((x, y, limits.ground.take_off_height), yaw, limits)
-        mission = Mission(held.commitment.payloads, held.commitment.stops, limits)
+        timeline = hold_hover((x, y, limits.ground.take_off_height), yaw, limits)
+        mission = Mission(timeline.commitment.payloads, timeline.commitment.stops, limits)
         mission = replace(mission, hold_time=max(limits.battery.endurance - mission.duration - 0.01, 0.0))
-        self._ends = held.ends
+        self._ends = timeline.ends
         if self._records is not None:
             place = (x, y, limits.ground.take_off_height)
             self._recording = SteeringRecord(
@@ -152,7 +152,7 @@ class SteeredVehicle:
             )
             self._on_record(self._recording)
         self._started = True
-        self._flight.start(mission, held, Listeners(self._hear, self._hear_answer))
+        self._flight.start(mission, timeline, Listeners(self._hear, self._hear_answer))
         if not self._flight.wait(lambda: self._phase in _FLYING and self._sent is not None, _TAKE_OFF_WITHIN):
             self._require_flying()
             self._end(Order.LAND)

@@ -8,6 +8,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
+from cfplan.air.requests import PathAnswer, Wish
+from cfplan.air.stepped import PLANNING, SteppedPlanner
+from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError
 from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
@@ -15,9 +18,6 @@ from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.process import Attendant
 from cfplan.flight.telemetry import Telemetry, Triple
-from cfplan.preparation.air_planner import PathAnswer, Wish
-from cfplan.preparation.replan import HeldFlight
-from cfplan.preparation.stepped_planner import PLANNING, SteppedPlanner
 from cfplan.safety.limits import Limits
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
@@ -57,8 +57,8 @@ class SteppedSteering:
         x, y, z, *_, qx, qy, qz, qw = self.lab.vehicle.stabilizer.loop.truth.tolist()[:10]
         return (x, y, z), yaw_of((qx, qy, qz, qw))
 
-    def start(self, mission: Mission, held: HeldFlight, listeners: Listeners) -> None:
-        self.planner = SteppedPlanner(held, mission.limits, self.clock, listeners.answer, planning=self._planning)
+    def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:
+        self.planner = SteppedPlanner(timeline, mission.limits, self.clock, listeners.answer, planning=self._planning)
         attendant = Attendant(self._orders.give, Keyboard(), listeners.telemetry, self._next_orders)
 
         def report(message: Telemetry) -> None:

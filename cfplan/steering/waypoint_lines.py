@@ -22,12 +22,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Protocol
 
+from cfplan.air.requests import Wish
 from cfplan.errors import FlightEndedError, InputError, RequestRefusedError, printable
 from cfplan.files.text import DECIMAL_COMMA_HINT, may_have_decimal_commas
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.telemetry import Triple
-from cfplan.preparation.air_planner import Wish
 from cfplan.steering.recorded_steering import answer_text
 from cfplan.steering.steered_vehicle import SteeredVehicle, checked_waypoints
 

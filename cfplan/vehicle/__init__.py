@@ -8,6 +8,7 @@ __all__ = [
     "hover",
     "joint",
     "measures",
+    "motor_commands",
     "panels",
     "profile",
     "profile_spline",

@@ -54,6 +54,8 @@ class Airframe:
     """1/(m/s)², gain of thrust at equal rotor speed per squared speed in the rotor plane."""
     voltage_sag: float = 0.0
     """1/V, fraction of thrust lost per volt of battery; 0 where the firmware compensates it."""
+    motor_curve: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """The firmware's cubic from a motor's voltage, V, to thrust, N, and the thrust of its full command; zeros: none."""
     spread: Spread = Spread()
 
     @property

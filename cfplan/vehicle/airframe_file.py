@@ -12,6 +12,7 @@ from cfplan.vehicle.airframe import Airframe, Spread, airframe_of
 # Bounds far beyond what flies indoors: beyond them digits would be lost, or a unit is wrong.
 Inertia = Annotated[float, Field(ge=1e-8, le=1.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
+Coefficient = Annotated[float, Field(ge=-10.0, le=10.0)]
 Moment = Annotated[float, Field(ge=0.0, le=0.1)]
 _USUAL = Spread()
 Drag = Annotated[float, Field(ge=0.0, le=10.0)]
@@ -46,6 +47,7 @@ class _AirframeFile(BaseModel):
     thrust_curvature: Annotated[float, Field(ge=-0.9, le=0.9)] = 0.0
     lift_with_speed: Annotated[float, Field(ge=-0.1, le=0.1)] = 0.0
     voltage_sag: Annotated[float, Field(ge=0.0, le=5.0)] = 0.0
+    motor_curve: tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient] = (0.0, 0.0, 0.0, 0.0, 0.0)
     spread: _SpreadFile = _SpreadFile()
 
 

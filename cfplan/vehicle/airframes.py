@@ -4,6 +4,8 @@ Sources:
   RotorPy    `rotorpy.vehicles.crazyflie_params` and `crazyfliebrushless_params` of RotorPy 3.0.0
   models     `drone_models/data/params.toml` of drone-models 0.1.0: identified on flying vehicles with markers
   firmware   crazyflie-firmware 2026.08: the motor thrust caps, which hold while the battery does (above about 3.1 V)
+  flights    public logs of flights, docs/results/real-flights.md: the brushless vehicle's drag and inertia, whose
+             yaw is in proportion; everything in AS_FLOWN
 
 Where `models` gives rotor dynamics n' = k₁(u − n) + k₂(u² − n²), up and down apart, the time constant here is the mean
 of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does. The rotor reaction is
@@ -12,12 +14,19 @@ firmware's default gains wherever the time constant exceeds 0.1 s.
 """
 
 import difflib
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
+# platform_defaults_cf2.h and platform_defaults_cf21bl.h of firmware 2026.08: VMOTOR2THRUST0 to 3, THRUST_MAX.
+_CURVE_21_PLUS = (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145, 0.12)
+_CURVE_UPGRADE = (0.006728127583707208, 0.01011557616217668, 0.010263198062061085, 0.0028358638322392503, 0.18)
+_CURVE_BRUSHLESS = (-0.014058926705279723, 0.04265273261724981, 0.0018327760144017432, 0.0020576974784587178, 0.20)
 _ROTORPY_HOVER = (0.030 * GRAVITY / 4 / 2.3e-8) ** 0.5  # rad/s, from mass and k_eta
 
 AIRFRAMES = MappingProxyType(
@@ -48,6 +57,7 @@ AIRFRAMES = MappingProxyType(
                 drag=(0.01351483, 0.01677452),
                 source="drone-models 0.1.0 cf2x_P250, measured with markers; thrust cap of firmware 2026.08",
                 rotor_reaction=3.98e-4,
+                motor_curve=_CURVE_21_PLUS,
             ),
             Airframe(
                 name="crazyflie-thrust-upgrade",
@@ -61,23 +71,49 @@ AIRFRAMES = MappingProxyType(
                 drag=(0.01556697, 0.02191672),
                 source="drone-models 0.1.0 cf2x_T350, measured with markers; thrust cap of firmware 2026.08",
                 rotor_reaction=3.89e-4,
+                motor_curve=_CURVE_UPGRADE,
             ),
             Airframe(
                 name="crazyflie-2.1-brushless",
                 mass=0.04338,
-                inertia=(25e-6, 28e-6, 49e-6),
+                inertia=(20e-6, 21e-6, 38e-6),
                 arm=0.050 / 2**0.5,
                 thrust_to_torque=0.00593893393599368,
                 motor_thrust_min=0.02136263065537499,
                 motor_thrust_max=0.20,
                 motor_time_constant=0.060,
-                drag=(0.02149163, 0.02359736),
-                source="drone-models 0.1.0 cf21B_500, measured with markers; thrust cap of firmware 2026.08",
+                drag=(0.36 * 0.04338, 0.37 * 0.04338),
+                source="drone-models 0.1.0 cf21B_500; drag, inertia: public flights; thrust cap of firmware 2026.08",
                 rotor_reaction=2.98e-4,
+                motor_curve=_CURVE_BRUSHLESS,
             ),
         )
     }
 )
+
+
+AS_FLOWN: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "crazyflie-2.1+": {
+            "velocity_moment": (4.5e-4, 6.2e-4), "thrust_scale": 1.06, "thrust_curvature": 0.1,
+            "lift_with_speed": 0.008, "drag": (0.01351483, 0.37 * 0.0318), "motor_time_constant": 0.080,
+        },
+        "crazyflie-thrust-upgrade": {
+            "velocity_moment": (4.6e-4, 5.5e-4), "thrust_scale": 1.50, "thrust_curvature": 0.3,
+            "lift_with_speed": 0.008, "drag": (0.01556697, 0.37 * 0.0379), "motor_time_constant": 0.065,
+        },
+        "crazyflie-2.1-brushless": {
+            "velocity_moment": (4.9e-4, 6.5e-4), "thrust_scale": 0.95, "thrust_curvature": -0.1,
+            "lift_with_speed": 0.008, "voltage_sag": 0.39, "motor_time_constant": 0.045,
+        },
+    }
+)  # fmt: skip
+"""What public flights show of each kind beside, by field: for predictions of vehicles as they are."""
+
+
+def as_flown(airframe: Airframe) -> Airframe:
+    """Return a shipped airframe with what public flights show of its kind; others are as their files say."""
+    return replace(airframe, **AS_FLOWN.get(airframe.name, {}))
 
 
 def load_airframe(name_or_file: str | Path) -> Airframe:

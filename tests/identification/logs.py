@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from cfplan.identification.flight_log import FlightLog
-from cfplan.identification.reference import Reference
+from cfplan.identification.reference import ReferenceMotion
 from cfplan.identification.replay import Controller
 from cfplan.simulation.engine.estimated_loop import EstimatorInput, fly_with_estimator
 from cfplan.simulation.engine.lee import REFERENCE_SIZE, LeeGains
@@ -22,7 +22,7 @@ CONTROLLER = Controller(GAINS)
 DURATION, RATE = 9.0, 250
 
 
-def figure8(duration: float = DURATION, period: float = 4.5) -> Reference:
+def figure8(duration: float = DURATION, period: float = 4.5) -> ReferenceMotion:
     """A figure eight of 2 m by 1 m, begun slowly from rest a second after the log begins."""
     time = np.arange(0.0, duration + 0.015, 0.005)
     since = np.maximum(time - 1.0, 0.0)
@@ -32,7 +32,7 @@ def figure8(duration: float = DURATION, period: float = 4.5) -> Reference:
     for order in (1, 2, 3):
         before = rows[:, 3 * order - 3 : 3 * order]
         rows[:, 3 * order : 3 * order + 3] = np.gradient(before, time, axis=0)
-    return Reference("a figure eight", time, rows)
+    return ReferenceMotion("a figure eight", time, rows)
 
 
 def logged(airframe=REAL, controller=CONTROLLER, reference=None, seed=0, sensors=True) -> FlightLog:

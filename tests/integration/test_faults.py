@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfplan.air.replanning import replan
+from cfplan.air.stepped import PlannerFault
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Phase
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.preparation.prepare_flight import prepare_mission
-from cfplan.preparation.replan import replan
-from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
@@ -22,7 +22,7 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.vehicle.airframe import GRAVITY
 from studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
-from studies.faults import STUDY, Settings, fly_scenario, fly_stepped, judge, prepare_held
+from studies.faults import STUDY, Settings, fly_scenario, fly_stepped, judge, prepare_timeline
 from studies.random_faults import fly_random, prepare_missions, random_scenario, with_silence
 from studies.runner.limits import limits_for
 from studies.runner.study import Run
@@ -86,7 +86,7 @@ def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, flown
 
 @pytest.mark.parametrize("scenario", [row for row in SCENARIOS if row.planner], ids=lambda row: row.name)
 def test_whatever_is_wrong_with_the_planner_the_flight_ends_in_the_committed_hover(scenario, flown, line):
-    held = prepare_held(LINE, line.limits)
+    held = prepare_timeline(LINE, line.limits)
     asked_for = replan(held, round(ASKED_AFTER * RATE) + 20, [ASKED], line.limits)  # what a planner that is well plans
     assert np.linalg.norm(decode(asked_for.proposal.payloads[-1:]).position[0] - ASKED) < 0.01
     row = flown(scenario.name)

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from stepped_flight import Flight, fly_stepped
 
+from cfplan.air.replanning import replan
+from cfplan.air.stopping import halt
+from cfplan.air.timeline import Replanned, Timeline, hold, joint_of
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.proposals import HeldProposals
-from cfplan.flight.setpoints.commitment import SPLICE_AHEAD, Commitment, Proposal, Refusal, checksum_of
+from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, checksum_of
 from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
@@ -21,7 +24,6 @@ from cfplan.flight.setpoints.stops import DURATION
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.replan import HeldFlight, Replanned, accepted, halt, hold, replan
 from cfplan.safety.certificate import certify
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -38,7 +40,7 @@ TRAVELS = 8  # setpoints from a request to the arrival of the proposal
 class Planner:
     """A planner in the pilot's thread: it plans at once, and its proposal arrives some setpoints later."""
 
-    held: HeldFlight
+    timeline: Timeline
     request: Callable[["Planner", int], Replanned | Proposal | None]  # what to propose, with this setpoint sent
     travels: int = TRAVELS
     answers: list[Commitment | Refusal] = field(default_factory=list)
@@ -55,7 +57,7 @@ class Planner:
     def _hear(self, _: Proposal, answer: Commitment | Refusal) -> None:
         self.answers.append(answer)
         if isinstance(answer, Commitment) and self._given is not None:
-            self.held = accepted(self._given, answer)
+            self.timeline = self._given.accepted(answer)
             self.plans.append(self._given)
 
     def react(self, message: Telemetry) -> None:
@@ -116,7 +118,7 @@ def sent_of(flight: Flight) -> dict[int, SetpointSent]:
 
 
 def assert_is_one_motion(flight: Flight, flown: JoinedTrajectory, limits, until: int) -> None:
-    """What was sent up to a number is the encoding of the joined trajectory, which keeps every limit all along."""
+    """What was sent up to a number is the encoding of one motion, which keeps every limit all along."""
     for trajectory in flown.trajectories:
         assert certify(trajectory, limits.plan, limits.space).passed
     whole = encode_trajectory(flown, space=limits.space)
@@ -129,20 +131,25 @@ def assert_is_one_motion(flight: Flight, flown: JoinedTrajectory, limits, until:
         assert np.abs(got - getattr(planned, name)[numbers]).max() <= 1.001e-3, name
 
 
-def assert_was_committed(flight: Flight, held: HeldFlight, plans: list[Replanned], limits) -> None:
-    """What was sent is, number by number, what was committed; each plan keeps every limit from its splice on."""
+def assert_was_committed(flight: Flight, held: Timeline, plans: list[Replanned], limits) -> None:
+    """What was sent is, number by number, what was committed; each plan keeps every limit from its splice on.
+
+    The setpoint at a splice is still that of the motion before.
+    """
     sequence = held.commitment.payloads
     for made in plans:
         splice = made.proposal.splice
-        hovering = np.repeat(sequence[-1:], max(splice - len(sequence), 0), axis=0)
-        sequence = np.concatenate([sequence[:splice], hovering, made.proposal.payloads])
+        hovering = np.repeat(sequence[-1:], max(splice + 1 - len(sequence), 0), axis=0)
+        sequence = np.concatenate([sequence, hovering])[: splice + 1]
+        np.testing.assert_array_equal(made.proposal.payloads[0], sequence[splice])
+        sequence = np.concatenate([sequence, made.proposal.payloads[1:]])
         if made.plan is None:
             continue  # a stop, which is certified as all stops are
         assert certify(made.plan.trajectory, limits.plan, limits.space).passed
-        later = made.held.flown.since(splice / RATE)
+        later = made.timeline.motion.since(splice / RATE)
         encoded = encode_trajectory(later, gains=gains_under(limits), space=limits.space)
         check_bytes(encoded, later, limits.plan)
-        np.testing.assert_array_equal(encoded.payloads, made.proposal.payloads)
+        np.testing.assert_array_equal(encoded.payloads[1:], made.proposal.payloads[1:])
     planned = decode(sequence)
     sent = {number: one for number, one in sent_of(flight).items() if number < len(sequence)}
     assert len(sent) > 0.98 * len(sequence)
@@ -153,7 +160,7 @@ def assert_was_committed(flight: Flight, held: HeldFlight, plans: list[Replanned
 
 def test_new_waypoints_are_flown_from_the_splice_on_and_the_vehicle_lands_at_their_end(held, mission, limits):
     planner = Planner(
-        held, once_at(150, lambda p, now: replan(p.held, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits))
+        held, once_at(150, lambda p, now: replan(p.timeline, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits))
     )
     flight = fly_stepped(mission, planner.react, proposals=planner.proposals)
     assert flight.outcome.exit_code is ExitCode.OK
@@ -161,13 +168,13 @@ def test_new_waypoints_are_flown_from_the_splice_on_and_the_vehicle_lands_at_the
     np.testing.assert_allclose(flight.truth.position[-1, :2], [0.4, 2.0], atol=0.1)
     assert flight.outcome.deviation.max < 0.1
     assert flight.truth.off_in_air[-1] == 0
-    assert_is_one_motion(flight, planner.held.flown, limits, 10_000)
+    assert_was_committed(flight, held, planner.plans, limits)
 
 
 def test_in_the_hover_at_its_end_a_flight_goes_on(held, mission, limits):
     planner = Planner(
         held,
-        once_at(held.commitment.last + 20, lambda p, now: replan(p.held, now + TAKES, [[0.0, 0.5, 1.0]], limits)),
+        once_at(held.commitment.last + 20, lambda p, now: replan(p.timeline, now + TAKES, [[0.0, 0.5, 1.0]], limits)),
     )
     flight = fly_stepped(replace(mission, hold_time=2.0), planner.react, proposals=planner.proposals)
     assert flight.outcome.exit_code is ExitCode.OK
@@ -217,22 +224,20 @@ def test_a_proposal_that_comes_well_before_the_next_setpoint_may_begin_with_the_
     assert flight.outcome.exit_code is ExitCode.OK
     assert [type(answer) for answer in answers] == [Commitment if in_time else Refusal]
     assert flight.outcome.lateness.max < 1e-6
-    assert_is_one_motion(
-        flight, made.held.flown if in_time else held.flown, limits, 10_000 if in_time else held.commitment.last
-    )
+    assert_was_committed(flight, held, [made] if in_time else [], limits)
 
 
 def late(planner, now, limits):
-    return replan(planner.held, now + 2, [[-0.5, 0.9, 1.0]], limits)
+    return replan(planner.timeline, now + 2, [[-0.5, 0.9, 1.0]], limits)
 
 
 def garbage(planner, now, limits):
-    good = replan(planner.held, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits).proposal
+    good = replan(planner.timeline, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits).proposal
     return replace(good, payloads=np.roll(good.payloads, 7))
 
 
 def another_joint(planner, now, limits):
-    good = replan(planner.held, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits).proposal
+    good = replan(planner.timeline, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits).proposal
     moved = good.splice + 3
     return replace(good, splice=moved, checksum=checksum_of(moved, good.payloads, good.stops))
 
@@ -249,13 +254,13 @@ def test_a_planner_that_is_late_or_wrong_changes_nothing(held, mission, limits, 
     assert flight.outcome.exit_code is ExitCode.OK
     assert [type(answer) for answer in planner.answers] == [Refusal]
     assert any("a new plan is refused" in text for text in flight.said)
-    assert_is_one_motion(flight, held.flown, limits, held.commitment.last)
+    assert_is_one_motion(flight, held.motion, limits, held.commitment.last)
 
 
 def test_an_order_to_land_counts_for_what_is_committed_then(held, mission, limits):
     """Once the new plan is flown, a stop goes along that plan."""
     planner = Planner(
-        held, once_at(100, lambda p, now: replan(p.held, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits))
+        held, once_at(100, lambda p, now: replan(p.timeline, now + TAKES, [[-0.5, 0.9, 1.0], [0.4, 2.0, 1.0]], limits))
     )
     orders: list[Order] = []
 
@@ -273,7 +278,7 @@ def test_an_order_to_land_counts_for_what_is_committed_then(held, mission, limit
 
     flight = fly_stepped(mission, react, more_orders=more, proposals=planner.proposals)
     assert flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
-    stopped = planner.held.flown.at(2.0 + 0.5 * DURATION).position  # as far as the flight goes in half the time
+    stopped = planner.timeline.motion.at(2.0 + 0.5 * DURATION).position  # as far as the flight goes in half the time
     np.testing.assert_allclose(flight.truth.position[-1, :2], stopped[:2], atol=0.15)
     assert limits.space.beyond(flight.truth.position)[:, :2].max() < 0.0
 
@@ -281,9 +286,9 @@ def test_an_order_to_land_counts_for_what_is_committed_then(held, mission, limit
 def test_a_stop_at_full_speed_brakes_as_hard_as_stops_may(held, mission, limits):
     """0.6 m from the setpoint at which it begins: the limit on braking alone would take 0.4 m, without time to lean."""
     moments = np.arange(0.0, held.ends, 0.01)
-    speeds = np.linalg.norm(held.flown.at(moments).velocity, axis=1)
+    speeds = np.linalg.norm(held.motion.at(moments).velocity, axis=1)
     fastest = int(np.argmax(speeds > 0.98 * limits.plan.speed)) or int(np.argmax(speeds))
-    planner = Planner(held, once_at(fastest - TAKES, lambda p, now: halt(p.held, now + TAKES, limits)))
+    planner = Planner(held, once_at(fastest - TAKES, lambda p, now: halt(p.timeline, now + TAKES, limits)))
     flight = fly_stepped(mission, planner.react, proposals=planner.proposals)
     assert len(planner.plans) == 1
     assert flight.outcome.exit_code is ExitCode.OK
@@ -302,7 +307,7 @@ def test_a_stop_over_the_top_of_a_climb_is_flown_as_closely_as_others(limits, sp
     points = np.array([[-1.0, -2.0, 0.6], [0.0, -0.6, 1.5], [0.2, 1.0, 0.7], [-0.5, 2.0, 1.0]])
     path = min_snap(points, times=centripetal_times(points))
     held = hold(plan(path, limits.airframe, limits, planner="expert"), points)
-    planner = Planner(held, once_at(splice - TAKES, lambda p, _: halt(p.held, splice, limits)))
+    planner = Planner(held, once_at(splice - TAKES, lambda p, _: halt(p.timeline, splice, limits)))
     mission = Mission(held.commitment.payloads, held.commitment.stops, limits, hold_time=1.0)
     flight = fly_stepped(mission, planner.react, proposals=planner.proposals)
     assert flight.outcome.exit_code is ExitCode.OK
@@ -328,20 +333,20 @@ def random_requests(random: np.random.Generator, limits, count: Counter):
         points = random.uniform(LOW, HIGH, (int(random.integers(1, 4)), 3))
         match kind:
             case "stop":
-                return halt(planner.held, now + TAKES, limits)
+                return halt(planner.timeline, now + TAKES, limits)
             case "outside":
                 points[-1, 2] = 3.0
             case "near":
-                points[0] = planner.held.flown.at((now + TAKES + SPLICE_AHEAD) / RATE).position + 0.02
+                points[0] = planner.timeline.motion.at(joint_of(now + TAKES)).position + 0.02
             case "late":
-                return replan(planner.held, now + 4, points, limits)
-            case "extend" if planner.held.ends - now / RATE < 8.0:
-                return replan(planner.held, now + TAKES, points, limits, keep=True)
+                return replan(planner.timeline, now + 4, points, limits)
+            case "extend" if planner.timeline.ends - now / RATE < 8.0:
+                return replan(planner.timeline, now + TAKES, points, limits, keep=True)
             case "garbage":
-                made = replan(planner.held, now + TAKES, points, limits).proposal
+                made = replan(planner.timeline, now + TAKES, points, limits).proposal
                 rolled = np.roll(made.payloads, int(random.integers(1, 100)))
                 return replace(made, payloads=rolled, checksum=checksum_of(made.splice, rolled, made.stops))
-        return replan(planner.held, now + TAKES, points, limits)
+        return replan(planner.timeline, now + TAKES, points, limits)
 
     return request
 

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from stepped_flight import Flight
 
+from cfplan.air.process import AirPlanner
+from cfplan.air.requests import PathAnswer, Wish
+from cfplan.air.timeline import hold
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.process import fly, start_pilot
 from cfplan.flight.telemetry import SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.preparation.air_planner import PathAnswer, Wish
-from cfplan.preparation.planner_process import AirPlanner
-from cfplan.preparation.replan import hold
 from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 

@@ -1,14 +1,17 @@
 """Plans that continue a motion: without a jump, certified, and refused in words where none can be flown."""
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from cfplan.air.replanning import JOINT_DELAYS
 from cfplan.errors import InfeasibleError, InputError
+from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planning.continuation import TooLateError, Ways, continue_plan, path_from_rest
+from cfplan.planning.continuation import NoWayError, continue_plan, plan_from_rest, with_room
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
 from cfplan.vehicle.joint import JoinedTrajectory
@@ -17,10 +20,27 @@ WAYPOINTS = np.array([[-1.2, -2.0, 0.8], [1.0, -1.0, 1.2], [-0.8, 0.6, 0.9], [0.
 CONTINUOUS = ("position", "velocity", "acceleration", "jerk", "quaternion", "body_rate", "yaw")
 
 
+def with_less(limits):
+    """Limits as plans in the air keep them, so that they can be continued."""
+    return replace(limits, plan=with_room(limits.plan, limits.airframe))
+
+
 @pytest.fixture(scope="module")
 def flown(limits):
     """A plan through all waypoints but the last."""
-    return plan(min_snap(WAYPOINTS[:4]), limits.airframe, limits, planner="expert", yaw=YawMode.FREE)
+    return plan(min_snap(WAYPOINTS[:4]), limits.airframe, with_less(limits), planner="expert", yaw=YawMode.FREE)
+
+
+def continued_soon(trajectory, leave, *given, **options):
+    """The plan from the first joint from which a path leads on, of those that are tried in flight.
+
+    A state just at a limit is all but decided: a little later it is another.
+    """
+    for leave_room in (True, False):
+        for delay in JOINT_DELAYS:
+            with suppress(NoWayError):
+                return continue_plan(trajectory, leave + delay / RATE, *given, leave_room=leave_room, **options)
+    raise NoWayError("from no joint")
 
 
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.55, 0.75])
@@ -40,15 +60,18 @@ def test_a_new_plan_goes_on_without_a_jump_and_is_certified(flown, limits, share
 
 
 def test_more_waypoints_ahead_change_the_way_little_and_save_the_stop(flown, limits):
-    """Extended early by the waypoint left out, the flight takes about as long as one planned through all at once."""
-    leave = 0.3 * flown.trajectory.duration
-    s = float(flown.trajectory.s_at(leave))
-    ahead = int(np.searchsorted(flown.path.breaks, s))
-    times = np.diff([s, *flown.path.breaks[ahead:]])
-    times = np.append(times, np.linalg.norm(WAYPOINTS[4] - WAYPOINTS[3]))
-    made = continue_plan(flown.trajectory, leave, WAYPOINTS[ahead:], limits, times=times, yaw=YawMode.FREE)
-    at_once = plan(min_snap(WAYPOINTS), limits.airframe, limits, planner="expert", yaw=YawMode.FREE)
-    assert leave + made.plan.trajectory.duration < 1.03 * at_once.trajectory.duration
+    """Extended early by a waypoint, the flight mostly takes no longer than one planned through all at once."""
+    at_once = plan(min_snap(WAYPOINTS), limits.airframe, limits, planner="expert").trajectory.duration
+    took = []
+    for fraction in np.arange(0.1, 0.6, 0.08):
+        leave = fraction * flown.trajectory.duration
+        reached = flown.path.breaks[flown.path.breaks > flown.trajectory.s_at(leave)]
+        ahead = WAYPOINTS[-1 - len(reached) :]
+        made = continue_plan(flown.trajectory, leave, ahead, limits, reached=reached)
+        np.testing.assert_allclose(made.plan.path(np.array(made.reached)), ahead, atol=1e-9)
+        took.append((leave + made.plan.trajectory.duration) / at_once)
+    assert np.median(took) < 1.0, took
+    assert max(took) < 1.1, took
 
 
 @pytest.mark.parametrize(
@@ -60,7 +83,7 @@ def test_more_waypoints_ahead_change_the_way_little_and_save_the_stop(flown, lim
     ],
 )
 def test_a_lower_speed_is_not_exceeded_between_the_nodes_either(flown, limits, speed, share, waypoints):
-    made = continue_plan(flown.trajectory, share * flown.trajectory.duration, waypoints, limits, speed=speed).plan
+    made = continued_soon(flown.trajectory, share * flown.trajectory.duration, waypoints, limits, speed=speed).plan
     times = np.arange(0.0, made.trajectory.duration, 5e-4)
     slowed_down = made.trajectory.s_at(times) > made.path.end / 2
     assert np.linalg.norm(made.trajectory.at(times[slowed_down]).velocity, axis=1).max() <= speed
@@ -128,31 +151,29 @@ def test_where_no_way_leads_through_a_waypoint_speed_and_distance_are_said(flown
 
 
 def test_waypoints_anywhere_in_the_space_are_flown_from_rest(limits):
-    """Nearly all, where of paths of least snap alone a third swing outside."""
     random = np.random.default_rng(3)
     low, high = np.array(limits.space.low) + limits.space.margin, np.array(limits.space.high) - limits.space.margin
-    inside = guided = 0
-    for _ in range(40):
+    made, tried = 0, 20
+    for _ in range(tried):
         points = random.uniform(low, high, (4, 3))
-        path, reached = path_from_rest(points, limits)
-        np.testing.assert_allclose(path(np.array(reached)), points[1:], atol=1e-9)
-        inside += bool((limits.space.beyond(path(np.linspace(0.0, path.end, 400))) <= 0.0).all())
-        if len(path.breaks) > len(points):
-            guided += 1
-            last = path
-    assert inside >= 39
-    assert 10 < guided < 30
-    assert plan(last, limits.airframe, limits, planner="expert").certificate.passed
+        try:
+            new = plan_from_rest(points, limits)
+        except InfeasibleError:
+            continue
+        made += 1
+        np.testing.assert_allclose(new.plan.path(np.array(new.reached)), points[1:], atol=1e-9)
+        assert certify(new.plan.trajectory, limits.plan, limits.space).passed
+        assert not new.plan.trajectory.at(0.0).velocity.any()
+    assert made >= 0.95 * tried
 
 
 @pytest.mark.parametrize("end", [[-0.8, 0.5, 1.0], [-0.8, 0.55, 1.1]], ids=["straight back", "almost straight back"])
-def test_who_is_to_fly_there_and_back_turns_round_in_a_loop(flown, limits, end):
-    """Of a path through such waypoints alone there is none but through a stop, or far outside."""
+def test_who_is_to_fly_there_and_back_turns_round_beside_the_wall(flown, limits, end):
     wall = limits.space.high[0] - limits.space.margin
     there = [wall - 0.05, 0.5, 1.0]
-    path, reached = path_from_rest([[0.0, 0.5, 1.0], there, end], limits)
-    np.testing.assert_allclose(path(np.array(reached)), [there, end], atol=1e-9)
-    assert plan(path, limits.airframe, limits, planner="expert").certificate.passed
+    made = plan_from_rest([[0.0, 0.5, 1.0], there, end], limits)
+    np.testing.assert_allclose(made.plan.path(np.array(made.reached)), [there, end], atol=1e-9)
+    assert certify(made.plan.trajectory, limits.plan, limits.space).passed
     leave = 0.3 * flown.trajectory.duration
     made = continue_plan(flown.trajectory, leave, [[0.0, 0.5, 1.0], there, end], limits)
     assert certify(made.plan.trajectory, limits.plan, limits.space).passed
@@ -171,9 +192,8 @@ def test_who_is_to_fly_there_and_back_turns_round_in_a_loop(flown, limits, end):
     ],
 )
 def test_who_sinks_fast_turns_off_above_the_floor(limits, down, share, waypoints):
-    """On a first segment that takes longer the path would swing below it."""
-    sinking = plan(min_snap(down), limits.airframe, limits, planner="expert").trajectory
-    made = continue_plan(sinking, share * sinking.duration, waypoints, limits)
+    sinking = plan(min_snap(down), limits.airframe, with_less(limits), planner="expert").trajectory
+    made = continued_soon(sinking, share * sinking.duration, waypoints, limits)
     assert certify(made.plan.trajectory, limits.plan, limits.space).passed
 
 
@@ -184,7 +204,7 @@ def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits)
         points = random.uniform(low, high, (3, 3))
         try:
             leave = float(random.uniform(0.1, 0.8)) * flown.trajectory.duration
-            new = continue_plan(flown.trajectory, leave, points, limits)
+            new = continued_soon(flown.trajectory, leave, points, limits)
         except InfeasibleError:
             continue
         made += 1
@@ -192,37 +212,16 @@ def test_most_waypoints_anywhere_in_the_space_are_flown_in_motion(flown, limits)
     assert made >= 0.9 * tried
 
 
-def test_who_must_turn_back_brakes_along_the_path_left_and_then_turns(flown, limits):
-    """No curve leads back from full speed inside the walls; a waypoint a metre behind is reached all the same."""
-    trajectory, braked = flown.trajectory, 0
-    for share in np.arange(0.1, 0.9, 0.05):
+def test_who_must_turn_back_from_full_speed_reaches_a_waypoint_a_metre_behind(flown, limits):
+    trajectory = flown.trajectory
+    for share in np.arange(0.1, 0.9, 0.1):
         leave = share * trajectory.duration
         state = trajectory.at(leave)
         back = state.position - state.velocity / np.linalg.norm(state.velocity)
         back = np.clip(back, np.array(limits.space.low) + 0.3, np.array(limits.space.high) - 0.3)
-        made = continue_plan(trajectory, leave, [back], limits)
-        begun = made.plan.path.breaks[1] / 2
-        s = float(trajectory.s_at(leave))
-        if np.allclose(made.plan.path(begun), trajectory.path(s + begun), atol=1e-9):
-            braked += 1
-            later = made.plan.trajectory.time_at(begun)
-            assert np.linalg.norm(made.plan.trajectory.at(later).velocity) <= limits.plan.speed
-    assert braked >= 3
-
-
-def test_a_way_that_does_not_lead_on_any_more_is_forgotten(flown, limits):
-    """Else a planner that comes too late after it would take it to be known, and come too late again."""
-    leave = 0.5 * flown.trajectory.duration
-    state = flown.trajectory.at(leave)
-    behind = state.position - 0.2 * state.velocity / np.linalg.norm(state.velocity)
-    ways = Ways()
-    continue_plan(flown.trajectory, leave, [behind], limits, ways=ways)
-    wrong = min(ways.failed)
-    known = Ways(found=wrong)
-    with pytest.raises(TooLateError):
-        continue_plan(flown.trajectory, leave, [behind], limits, ways=known, too_late=lambda: True)
-    assert known.found not in (None, wrong)
-    assert wrong in known.failed
+        made = continued_soon(trajectory, leave, [back], limits)
+        np.testing.assert_allclose(made.plan.path(np.array(made.reached)), [back], atol=1e-9)
+        assert certify(made.plan.trajectory, limits.plan, limits.space).passed
 
 
 @pytest.mark.parametrize("waypoints", [[], [[1, 2]], [[np.nan, 0, 1]], [[0.5, 0, 1], [0.5, 0, 1]]])

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InfeasibleError
-from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.geometry.path_file import path_through
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.planning.continuation import continue_plan
-from cfplan.planning.plan import plan
+from cfplan.planning.continuation import continue_plan, plan_from_rest
+from cfplan.planning.path.choice import fastest_path
 from cfplan.safety.space import Space
 
 BOX = [[-1.6, -3.2, 0.5], [1.6, 3.2, 1.5]]
@@ -24,44 +24,39 @@ def wide(limits):
     return replace(limits, space=space, battery=replace(limits.battery, endurance=1e4))
 
 
-def planned(points, limits):
-    path = min_snap(points, times=centripetal_times(points))
-    return plan(path, limits.airframe, limits, planner="expert").trajectory
-
-
 def flown_in(points, limits) -> float:
     """Return the time, s, through points of which each becomes known where the third before it is passed.
 
     Where no plan leads on, the vehicle flies to the end of what it has, and goes on from rest.
     """
-    spans = centripetal_times(points)
-    trajectory, reached = planned(points[: KNOWN + 1], limits), np.cumsum(spans[:KNOWN])
+    made = plan_from_rest(points[: KNOWN + 1], limits)
     clock, known = 0.0, KNOWN + 1
     while known < len(points):
+        trajectory, reached = made.plan.trajectory, made.reached
         passed = float(trajectory.time_at(reached[0]))
         ahead = points[known - len(reached) + 1 : known + 1]
         for leave in passed + MOMENTS:
-            s = float(trajectory.s_at(leave))
             try:
-                times = np.append(np.diff([s, *reached[1:]]), spans[known - 1])
-                made = continue_plan(trajectory, leave, ahead, limits, times=times)
+                made = continue_plan(trajectory, leave, ahead, limits, reached=reached[1:])
             except InfeasibleError:
                 continue
-            clock, trajectory, reached = clock + leave, made.plan.trajectory, np.array(made.reached)
+            clock += leave
             known += 1
             break
         else:
             clock += trajectory.duration
             rest = points[known - 1 : known - 1 + KNOWN + 1]
-            trajectory, reached = planned(rest, limits), np.cumsum(centripetal_times(rest))
+            made = plan_from_rest(rest, limits)
             known += len(rest) - 1
-    return clock + trajectory.duration
+    return clock + made.plan.trajectory.duration
 
 
 def costs(seeds, limits) -> np.ndarray:
     """Return (N, 2): s of flight through all waypoints at once, and with three known."""
     paths = [random_waypoints(seed, BOX, (WAYPOINTS, WAYPOINTS)) for seed in seeds]
-    return np.array([(planned(points, limits).duration, flown_in(points, limits)) for points in paths])
+    return np.array(
+        [(fastest_path(path_through(points), limits).duration, flown_in(points, limits)) for points in paths]
+    )
 
 
 def test_knowing_three_waypoints_costs_little(wide):

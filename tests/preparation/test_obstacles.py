@@ -9,6 +9,9 @@ import pytest
 from link_loss_oracle import fly_on
 from stepped_flight import fly_stepped
 
+from cfplan.air.certifying import EndsBadlyError
+from cfplan.air.replanning import replan
+from cfplan.air.timeline import hold, hold_hover
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.on_board.fall import falls_from
@@ -24,11 +27,9 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.continuation import check_waypoints
 from cfplan.planning.plan import plan
 from cfplan.planning.plan_file import load_plan, save_plan
-from cfplan.preparation.certified_flight import EndsBadlyError
 from cfplan.preparation.link_loss_assessment import assess_link_loss
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import make_mission, prepare_flight
-from cfplan.preparation.replan import accepted, hold, hold_hover, replan
 from cfplan.preparation.slow_motion import require_harmless_slow_motion
 from cfplan.safety.certificate import OBSTACLES, certify
 from cfplan.safety.limits import Ladder, Limits
@@ -276,7 +277,7 @@ def test_what_is_committed_in_the_air_keeps_the_margin_from_obstacles(around, ta
     made = replan(held, 105, [target], here)
     committed = splice(held.commitment, made.proposal, 100, here)
     assert isinstance(committed, Commitment), str(committed)
-    new = accepted(made, committed)
+    new = made.accepted(committed)
     for payloads in (new.commitment.payloads, new.commitment.stops.reshape(-1, PAYLOAD_SIZE)):
         places = decode(payloads).position
         assert np.hypot(places[:, 0], places[:, 1] - 1.0).min() >= 0.15 + here.space.margin - 1.1e-3

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from cfplan.air.certifying import require_inside
+from cfplan.air.timeline import hold_hover
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation
@@ -19,8 +21,6 @@ from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.continuation import check_waypoints
 from cfplan.planning.plan import plan
-from cfplan.preparation.certified_flight import require_inside
-from cfplan.preparation.replan import hold_hover
 from cfplan.safety.certificate import WALLS, certify, share_of
 from cfplan.safety.limits import Ladder
 from cfplan.safety.quantities import AT_LEAST, Quantity

@@ -7,8 +7,8 @@ from unittest.mock import Mock
 import pytest
 from waiting import until
 
+from cfplan.air.requests import PathAnswer, PathVerdict
 from cfplan.errors import CfplanError
-from cfplan.preparation.air_planner import PathAnswer, PathVerdict
 from cfplan.preparation.steps import ignore_steps
 from cfplan.steering import real_time_steering
 from cfplan.steering.flight_in_progress import Listeners

@@ -9,13 +9,13 @@ from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
 import cfplan
+from cfplan.air.requests import PathVerdict
+from cfplan.air.stepped import PlannerFault
 from cfplan.cli import cfplan as command_line
 from cfplan.errors import InputError, NotCertifiedError
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.planning.plan_file import load_plan, save_plan
-from cfplan.preparation.air_planner import PathVerdict
-from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_IN_FLIGHT
 from cfplan.recording.rerun import layout

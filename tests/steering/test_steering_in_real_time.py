@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import cfplan
-from cfplan.preparation.air_planner import PathVerdict, Wish
+from cfplan.air.requests import PathVerdict, Wish
 from cfplan.recording.reader import read_record
 from cfplan.steering.recertify import recertify
 

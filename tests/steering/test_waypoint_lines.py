@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from waiting import until
 
+from cfplan.air.requests import Wish
+from cfplan.air.stepped import PlannerFault
 from cfplan.cli import cfplan as command_line
 from cfplan.errors import ExitCode, FlightEndedError, InputError
 from cfplan.flight.pilot.keys import Order
-from cfplan.preparation.air_planner import Wish
-from cfplan.preparation.stepped_planner import PlannerFault
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import (

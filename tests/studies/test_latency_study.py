@@ -6,26 +6,33 @@ import numpy as np
 import pytest
 
 from cfplan.errors import InputError
-from studies.latency import DELAYS, ONE_BY_ONE, PARTS, STUDY, Settings, Stretch, find_replans, first_change
+from cfplan.flight.setpoints.commitment import QUANTUM
+from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
+from studies.latency import DELAYS, ONE_BY_ONE, PARTS, STUDY, Settings, Stretch, find_replans, first_changes
 
 
-def rows(*values):
-    return np.repeat(np.array(values, dtype=np.uint8)[:, None], 29, axis=1)
+def rows(*positions):
+    """Setpoints at places along x, in quanta."""
+    places = np.array(positions, dtype=float)[:, None] * [QUANTUM, 0.0, 0.0]
+    still = np.zeros_like(places)
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(places), 1))
+    return encode(FullStateSetpoints(places, still, still, level, still))
 
 
 @pytest.mark.parametrize(
-    ("splice", "payloads", "number"),
+    ("splice", "payloads", "numbers"),
     [
         (2, rows(2, 3, 4), None),  # the same as before
-        (2, rows(2, 3, 9, 9), 4),
-        (2, rows(2, 8, 4), 3),
+        (2, rows(2, 3, 9, 9), (4, 4)),
+        (2, rows(2, 4, 9), (3, 4)),  # off by a quantum first, then by more
+        (2, rows(2, 4, 4), None),
         (3, rows(3, 4, 4, 4), None),  # beyond the end the last one is repeated
-        (3, rows(3, 4, 4, 7), 6),
-        (9, rows(4, 5), 10),
+        (3, rows(3, 4, 4, 7), (6, 6)),
+        (9, rows(4, 6), (10, 10)),
     ],
 )
-def test_the_first_changed_setpoint_is_the_first_with_other_bytes(splice, payloads, number):
-    assert first_change(rows(0, 1, 2, 3, 4), splice, payloads) == number
+def test_the_first_changes_are_of_bytes_and_of_more_than_a_quantum_of_position(splice, payloads, numbers):
+    assert first_changes(rows(0, 1, 2, 3, 4), splice, payloads) == numbers
 
 
 def replan(*times):
@@ -41,7 +48,7 @@ def tables(replans):
 def test_its_table_has_a_row_for_each_delay():
     found = tables([replan(0.05 + 0.001 * k, 0.2 + 0.001 * k, 0.04) for k in range(101)])
     first = found["latency"][0]
-    assert [row["what"] for row in found["latency"]] == ["first changed setpoint", "change of the motion", "answer"]
+    assert [row["what"] for row in found["latency"]] == ["first changed setpoint", "changed motion", "answer"]
     assert (first["count"], first["median"], first["p99"]) == (101, pytest.approx(0.1), pytest.approx(0.149))
     assert [(row["what"], row["rate"]) for row in found["rate"]] == [("hovering, no requests", 0.0)]
 

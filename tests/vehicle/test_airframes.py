@@ -9,7 +9,7 @@ import yaml
 
 from cfplan.errors import InputError
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.airframes import AIRFRAMES, load_airframe
+from cfplan.vehicle.airframes import AIRFRAMES, AS_FLOWN, as_flown, load_airframe
 
 FIRMWARE = Path(__file__).parents[3] / "shared" / "data" / "firmware"
 
@@ -47,6 +47,18 @@ def test_the_2_1_plus_is_the_body_that_the_firmware_was_flown_on():
     assert airframe.arm == pytest.approx(float(body["arm_per_axis"]))
     assert airframe.thrust_to_torque == pytest.approx(float(body["thrust_to_torque"]))
     assert airframe.motor_thrust_max == body["thrust_max_N"]
+
+
+@pytest.mark.parametrize("name", AS_FLOWN)
+def test_as_flown_a_vehicle_has_moment_scale_and_lift_and_still_hovers(name):
+    airframe, flown = AIRFRAMES[name], as_flown(AIRFRAMES[name])
+    assert flown.mass == airframe.mass
+    assert all(3e-4 < moment < 8e-4 for moment in flown.velocity_moment)
+    assert flown.thrust_scale != 1.0
+    assert flown.lift_with_speed > 0.0
+    assert flown.hover_thrust / flown.thrust_scale < flown.motor_thrust_max
+    assert 0.3 < flown.drag[0] / flown.mass < 0.45  # 1/s, as public flights show of each kind
+    assert as_flown(AIRFRAMES["crazyflie-2.0"]) == AIRFRAMES["crazyflie-2.0"]
 
 
 def test_an_unknown_vehicle_is_refused_with_the_known_ones():

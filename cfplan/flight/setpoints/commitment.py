@@ -14,7 +14,6 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
 """
 
-import math
 import struct
 import zlib
 from bisect import bisect_left
@@ -26,16 +25,15 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, LEAD, RATE, controller_attitude
+from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE, controller_attitude
 from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, excess_of, motion_extremes
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, positions_of
-from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD, turns_for
+from cfplan.flight.setpoints.rate_trade import turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of, yaw_of
 
-SPLICE_AHEAD = math.ceil((LEAD + BRAKE_LEAD) * RATE)  # setpoints from a splice to its joint: so far ahead one looks
 LEAST_AHEAD = 0  # setpoints from the one just sent to a splice, at least: the first that is another comes behind that
 FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
 LONGEST_ENDING = 1000  # stops of a proposal that are not sent, at most, so that a message cannot ask for any memory
@@ -274,7 +272,7 @@ def _moves_at_end(proposal: Proposal) -> Refusal | None:
 
 def _unfit(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
     """Return why the setpoints must not be flown; the stop at their end is judged with the other stops."""
-    end = len(proposal.payloads) - proposal.ending
+    end = max(len(proposal.payloads) - (proposal.ending + 1 if proposal.ending else 0), 1)
     if found := _first_wrong(proposal.payloads[None], before, end, limits, in_stop=False):
         fault, what, _, row = found
         return Refusal(fault, f"setpoint {proposal.splice + row} {what}")

@@ -61,7 +61,7 @@ def _by_path(problem: Problem, attempt: Attempt, path: Path) -> tuple[NDArray, N
     at_points = _by_point_data(problem, attempt, multipliers[:of_points])
     speed_s = layout.speed_s * problem.step
     tangent = path(speed_s, 1).T
-    held = np.where(np.isfinite(problem.highest), problem.highest * multipliers[of_points:][: len(speed_s)], 0.0)
+    held = np.where(np.isfinite(problem.highest), problem.highest, 0.0) * multipliers[of_points:][: len(speed_s)]
     by_speed = np.zeros((4, 3, len(speed_s)))
     by_speed[0] = 2.0 * held * tangent / np.maximum((tangent**2).sum(axis=0), _STILL)
     return np.append(layout.s * problem.step, speed_s), np.concatenate([at_points, by_speed], axis=-1)

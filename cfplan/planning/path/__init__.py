@@ -1,3 +1,3 @@
 """The choice of the fastest path through waypoints."""
 
-__all__ = ["choice"]
+__all__ = ["choice", "onward", "variables"]

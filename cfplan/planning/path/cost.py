@@ -15,14 +15,15 @@ from cfplan.deadline import Deadline
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap_gradient import gradient_by_times_and_points
 from cfplan.geometry.path import Path
-from cfplan.geometry.path_file import PathFile
-from cfplan.geometry.waypoints import Gate
+from cfplan.geometry.waypoints import Gate, Region
+from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.sensitivity import sensitivity
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.path.room import Room
 from cfplan.planning.path.variables import ChoiceVariables, Knots
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import distances_beyond, inside
+from cfplan.vehicle.profile import BoundaryState
 
 NODES_PER_METRE, NODES_PER_PIECE, LEAST_NODES = 4, 4, 60  # of the expert's grid while a path is chosen
 STILL = 1e-3  # of the nominal speed, below which a path stands still
@@ -32,11 +33,21 @@ _SAMPLES = 33  # of each piece, where a corridor is checked
 Timing = tuple[float, NDArray, NDArray]  # s; its derivatives, (5, 3, P), by γ to γ'''' at some places; those, (P,)
 
 
+@dataclass(frozen=True, slots=True)
+class Course:
+    """What a path is chosen for, besides its room."""
+
+    regions: tuple[Region, ...]  # one for each waypoint
+    yaw: YawMode
+    yaw_angle: float  # rad
+    start: BoundaryState | None = None  # in motion; None: at rest
+
+
 @dataclass(slots=True, eq=False)
 class PathCost:
     """The flight time along the path of some variables, s, and what leaving the room costs; with its gradient."""
 
-    path_file: PathFile
+    course: Course
     limits: Limits
     room: Room
     variables: ChoiceVariables
@@ -66,8 +77,8 @@ class PathCost:
     def _flight_time(self, path: Path) -> Timing | None:
         """Return the flight time, s, and its derivatives, (5, 3, P), by the path at some places, (P,)."""
         task = PlanningTask(
-            path, self.limits.airframe, self.limits.plan, nodes=self.nodes, yaw=self.path_file.yaw,
-            yaw_angle=self.path_file.yaw_angle, deadline=self.deadline,
+            path, self.limits.airframe, self.limits.plan, nodes=self.nodes, yaw=self.course.yaw,
+            yaw_angle=self.course.yaw_angle, start=self.course.start, deadline=self.deadline,
         )  # fmt: skip
         flown = sensitivity(task, self.near)
         if flown is None:
@@ -97,29 +108,29 @@ class PathCost:
             return failed
         duration, of_time, places = timed
         at = np.linspace(0.0, path.end, 2 * self.nodes + 1)
-        left, by_position = self.room.penalty(path(at), self._leg(knots, at), self.reserve)
+        lacking, by_position = self.room.penalty(path(at), self._leg(knots, at), self.reserve)
         share = self.weight * path.end / len(at)
         by_place = np.zeros((5, 3, len(at)))
         by_place[0] = share * by_position.T
         backwards, by_tangent, gates = self._backwards(knots, path)
         s = np.concatenate([places, at, gates])
         by_times, by_points = gradient_by_times_and_points(
-            knots.points, knots.times, s, np.concatenate([of_time, by_place, by_tangent], axis=-1)
-        )
+            knots.points, knots.times, s, np.concatenate([of_time, by_place, by_tangent], axis=-1),
+            knots.start_derivatives,
+        )  # fmt: skip
         if len(gates):  # which move with the times before them
             moved = (by_tangent[1] * path(gates, 2).T).sum(axis=0)
-            breaks = np.cumsum(knots.times)
-            by_times += ((gates[:, None] > breaks - 1e-9 * path.end) * moved[:, None]).sum(axis=0)
-        return duration + share * left + backwards, self.variables.gradient(x, by_times, by_points), duration
+            by_times += ((gates[:, None] > knots.breaks[1:] - 1e-9 * path.end) * moved[:, None]).sum(axis=0)
+        cost = duration + share * float(lacking.sum()) + backwards
+        return cost, self.variables.gradient(x, by_times, by_points), duration
 
     def _leg(self, knots: Knots, s: NDArray) -> NDArray:
         """Return which line between waypoints each place belongs to, (P,)."""
-        ends = np.concatenate([[0.0], np.cumsum(knots.times)])[knots.waypoint[1:-1]]
-        return np.searchsorted(ends, s, side="right")
+        return np.searchsorted(knots.breaks[knots.waypoint[1:-1]], s, side="right")
 
     def _backwards(self, knots: Knots, path: Path) -> tuple[float, NDArray, NDArray]:
         """Return the cost of passing gates backwards, s, its gradient by γ' there, (5, 3, G), and their s, (G,)."""
-        regions = zip(knots.waypoint, self.path_file.regions, strict=True)
+        regions = zip(knots.waypoint, self.course.regions, strict=True)
         gates = [(point, region.forwards) for point, region in regions if isinstance(region, Gate)]
         gates = [(point, forwards) for point, forwards in gates if 0 < point < len(knots.times)]
         if not gates:

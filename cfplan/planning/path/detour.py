@@ -5,6 +5,7 @@ It is where the search for a path begins, and decides on which side obstacles ar
 """
 
 import itertools
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +21,10 @@ def with_corners(waypoints: NDArray, space: Space) -> tuple[NDArray, NDArray]:
 
     A way for which no detour is found is left as it is.
     """
-    found, rows, grid = [waypoints[0]], [0], None
+    found, rows = [waypoints[0]], [0]
     for begin, end in itertools.pairwise(waypoints):
         if space.obstacles and not _in_sight(begin, end, space):
-            grid = grid or _Grid(space)
-            found += grid.corners(begin, end)
+            found += _grid(space).corners(begin, end)
         found.append(end)
         rows.append(len(found) - 1)
     return np.array(found), np.array(rows)
@@ -34,6 +34,11 @@ def _in_sight(begin: NDArray, end: NDArray, space: Space) -> bool:
     """Return whether the straight way between two places is clear."""
     count = 2 + int(np.linalg.norm(end - begin) / _SIGHT)
     return bool(inside(space.farthest(np.linspace(begin, end, count))))
+
+
+@lru_cache(maxsize=2)  # the same room is asked about again and again in flight
+def _grid(space: Space) -> "_Grid":
+    return _Grid(space)
 
 
 class _Grid:

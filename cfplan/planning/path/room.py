@@ -49,20 +49,20 @@ class Room:
         aside = np.linalg.norm(away - along[..., None] * step, axis=-1).min(axis=1)
         return np.asarray(aside - (np.inf if self.corridor is None else self.corridor))
 
-    def penalty(self, positions: NDArray, leg: NDArray, reserve: float) -> tuple[float, NDArray]:
-        """Return the sum of squares of what positions lack to a `reserve`, m, in m², and its gradient, (P, 3) m.
+    def penalty(self, positions: NDArray, leg: NDArray, reserve: float) -> tuple[NDArray, NDArray]:
+        """Return the square of what each position lacks to a `reserve`, m, (P,) m², and its gradient, (P, 3) m.
 
         `positions` is (P, 3) m.
         """
         near = np.maximum(self._wanted(positions, leg, reserve), 0.0)
         gradient = np.zeros_like(positions)
         rows = np.flatnonzero(near.any(axis=1))
-        for axis in range(3):
+        for axis in range(3 if len(rows) else 0):
             moved = positions[rows]
             moved[:, axis] += _MOVED
             change = np.maximum(self._wanted(moved, leg[rows], reserve), 0.0) - near[rows]
             gradient[rows, axis] = 2.0 * (near[rows] * change).sum(axis=1) / _MOVED
-        return float((near**2).sum()), gradient
+        return (near**2).sum(axis=1), gradient
 
     def _wanted(self, positions: NDArray, leg: NDArray, reserve: float) -> NDArray:
         beyond = self.beyond(positions, leg) + reserve

@@ -10,7 +10,7 @@ from cfplan.deadline import Deadline
 from cfplan.geometry.min_snap import centripetal_times
 from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.waypoints import Gate
-from cfplan.planning.path.cost import PathCost
+from cfplan.planning.path.cost import Course, PathCost
 from cfplan.planning.path.descent import Cost, descend
 from cfplan.planning.path.detour import with_corners
 from cfplan.planning.path.room import Room
@@ -88,10 +88,11 @@ def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadli
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     timings = *timed(points, waypoint), Knots(flown * (lengths.sum() / flown.sum()), points, waypoint)
     starts = [_started(path_file, knots) for knots in timings]
+    course = Course(path_file.regions, path_file.yaw, path_file.yaw_angle)
     costs = []
     for start in starts:
         variables = variables_of(start, path_file.regions, path_file.laps, limits.space.margin)
-        costs.append(PathCost(path_file, limits, room, variables, deadline))
+        costs.append(PathCost(course, limits, room, variables, deadline))
     cost = min(costs, key=lambda each: each(each.variables.first)[0])
     x = cost.variables.first
     if not inside(cost.missed(x)):

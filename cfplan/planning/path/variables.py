@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.geometry.min_snap import least_snap
+from cfplan.geometry.continued import continued_through
+from cfplan.geometry.min_snap import REST, least_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.waypoints import Gate, Region, Within
 
@@ -24,11 +25,24 @@ class Knots(NamedTuple):
     times: NDArray  # (M,) s
     points: NDArray  # (M+1, 3) m
     waypoint: NDArray  # (K,) the numbers of the waypoints among the points
+    start: NDArray | None = None  # (5, 3) γ to γ'''' where the path begins in motion; None: at rest
 
     @property
     def path(self) -> Path:
         """Return the path of least snap through the points. Raises InputError where there is none."""
-        return least_snap(self.points, self.times)
+        if self.start is None:
+            return least_snap(self.points, self.times)
+        return continued_through(self.start, self.points, self.times)
+
+    @property
+    def breaks(self) -> NDArray:
+        """Return s at each point, (M+1,)."""
+        return np.concatenate([[0.0], np.cumsum(self.times)])
+
+    @property
+    def start_derivatives(self) -> NDArray:
+        """Return γ', γ'', γ''' at the start, (3, 3)."""
+        return REST if self.start is None else self.start[1:4]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +76,7 @@ class ChoiceVariables:
         of_lap = np.zeros((len(self.axes), 3))
         np.add.at(of_lap, self.point_of, by_points)
         _, slopes = self._offsets(x)
-        by_moves = np.einsum("pc,pqc->pq", of_lap[self.moving], slopes)
+        by_moves = (slopes @ of_lap[self.moving, :, None])[..., 0]
         return np.concatenate([np.bincount(self.time_of, by_logs), by_moves.ravel()])
 
     def _times(self, x: NDArray) -> NDArray:
@@ -74,9 +88,12 @@ class ChoiceVariables:
         """Return how far the points of a lap moved, (P, 3) m, and the derivatives by their variables, (Q, 3, 3)."""
         q = x[int(self.time_of.max()) + 1 :].reshape(-1, 3)
         axes, bounded = self.axes[self.moving], self.bounded[self.moving, None]
+        offsets = np.zeros((len(self.axes), 3))
+        if not bounded.any():
+            offsets[self.moving] = (q[:, None] @ axes)[:, 0]
+            return offsets, axes
         squares = np.where(bounded == 1, (q**2).sum(axis=1, keepdims=True), q**2) * (bounded > 0)
         root = np.sqrt(1.0 + squares)
-        offsets = np.zeros((len(self.axes), 3))
         offsets[self.moving] = np.einsum("pq,pqc->pc", q / root, axes)
         slopes = np.eye(3) / root[:, None]
         slopes -= np.where(bounded == 1, 1.0, 0.0)[..., None] * q[:, :, None] * q[:, None] / root[..., None] ** 3
@@ -113,8 +130,7 @@ def variables_of(knots: Knots, regions: tuple[Region, ...], laps: int, margin: f
 
 def with_points_between(knots: Knots) -> Knots:
     """Return knots with one more between each two, where the path of least snap is half-way in time."""
-    path = knots.path
-    breaks = np.concatenate([[0.0], np.cumsum(knots.times)])
+    path, breaks = knots.path, knots.breaks
     points = np.empty((2 * len(knots.points) - 1, 3))
     points[::2], points[1::2] = knots.points, path((breaks[:-1] + breaks[1:]) / 2)
-    return Knots(np.repeat(knots.times / 2, 2), points, 2 * knots.waypoint)
+    return Knots(np.repeat(knots.times / 2, 2), points, 2 * knots.waypoint, knots.start)

@@ -1,3 +1,3 @@
 """The report: a page with the figures and charts of flights."""
 
-__all__ = ["page", "report"]
+__all__ = ["charts", "page", "report"]

@@ -14,7 +14,8 @@ from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW, Setpoint
 from cfplan.simulation.virtual_crazyflie.stabilizer import Loop
 from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.motor_commands import FULL_COMMAND, compensated_pwm
 from cfplan.vehicle.rotations import matrix_of, roll_pitch_of, yaw_of
 
 Getter = Callable[[], float]
@@ -39,6 +40,7 @@ def log_variables(
     localization: Localization,
     supervisor: Supervisor,
     battery: Battery,
+    airframe: Airframe,
     setpoint: Callable[[], Setpoint],
     info: Callable[[], int],
 ) -> Mapping[str, Getter]:
@@ -63,7 +65,7 @@ def log_variables(
     for place, name in enumerate("xyzw"):
         found[f"locSrv.q{name}"] = _element(localization.latest, 3 + place)
     found |= _variances(kalman) | _attitude(belief) | _accelerations(loop) | _targets(setpoint)
-    found |= _motors(loop) | _power(battery)
+    found |= _motors(loop, battery, airframe) | _power(battery)
     found["supervisor.info"] = info
     found["sys.canfly"] = lambda: supervisor.can_fly
     found["sys.isFlying"] = lambda: supervisor.is_flying
@@ -135,8 +137,11 @@ def _targets(setpoint: Callable[[], Setpoint]) -> dict[str, Getter]:
     return found
 
 
-def _motors(loop: Loop) -> dict[str, Getter]:
-    found: dict[str, Getter] = {f"motor.m{place + 1}": _element(loop.motors, place) for place in range(4)}
+def _motors(loop: Loop, battery: Battery, airframe: Airframe) -> dict[str, Getter]:
+    def pwm(place: int) -> Getter:
+        return lambda: compensated_pwm(float(loop.motors[place]) / FULL_COMMAND, battery.voltage, airframe)
+
+    found: dict[str, Getter] = {f"motor.m{place + 1}": pwm(place) for place in range(4)}
     for place, name in enumerate(("thrust", "roll", "pitch", "yaw")):
         found[f"controller.cmd_{name}"] = _element(loop.control, place)
         found[f"ctrlMel.cmd_{name}"] = _element(loop.control, place)

@@ -103,6 +103,7 @@ class VirtualCrazyflie:
                 localization=self.localization,
                 supervisor=self.supervisor,
                 battery=self.battery,
+                airframe=airframe,
                 setpoint=lambda: self.setpoint,
                 info=self.info,
             ),

@@ -15,7 +15,6 @@ from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.commitment import (
     KEPT_BEHIND,
     LEAST_AHEAD,
-    SPLICE_AHEAD,
     Commitment,
     Fault,
     Proposal,
@@ -66,18 +65,21 @@ def committed(flown):
     return Commitment(0, setpoints.payloads, stops_of(setpoints))
 
 
-def continued(flown, number, waypoints, limits):
-    """The flight that leaves `flown` where setpoint `number` is spliced, and its setpoints from there on."""
-    joint = (number + SPLICE_AHEAD) / RATE
+def continued(flown, committed, number, waypoints, limits):
+    """The flight that leaves `flown` at setpoint `number`, and its setpoints from there on, the first as committed."""
+    joint = number / RATE + LEAD
     new = continue_plan(flown.trajectories[-1], joint - flown.starts[-1], waypoints, limits)
     joined = flown.continued(joint, new.plan.trajectory)
-    return joined, encoded(joined, number)
+    setpoints = encoded(joined, number)
+    payloads = setpoints.payloads.copy()
+    payloads[0] = committed.payloads[number - committed.first]
+    return joined, replace(setpoints, payloads=payloads, decoded=decode(payloads))
 
 
 @pytest.fixture(scope="module")
 def spliced(flown, committed, limits):
     """A flight and the proposal that makes it, with the splice at setpoint 120."""
-    joined, setpoints = continued(flown, 120, [[0.2, 1.0, 1.0], [-1.0, 2.4, 1.1]], limits)
+    joined, setpoints = continued(flown, committed, 120, [[0.2, 1.0, 1.0], [-1.0, 2.4, 1.1]], limits)
     return joined, propose(committed, 120, setpoints.payloads, stops_of(setpoints))
 
 
@@ -110,17 +112,17 @@ def test_its_bytes_and_stops_pass_the_checks_of_every_plan(spliced, limits):
 def test_splices_follow_one_another(flown, committed, spliced, limits):
     joined, proposal = spliced
     one = splice(committed, proposal, 100, limits)
-    further, setpoints = continued(joined, 150, [[-0.3, 1.4, 1.1], [1.0, 2.2, 0.9]], limits)
-    second = splice(one, propose(one, 150, setpoints.payloads, stops_of(setpoints)), 140, limits)
+    further, setpoints = continued(joined, one, 155, [[-0.3, 1.4, 1.1], [1.0, 2.2, 0.9]], limits)
+    second = splice(one, propose(one, 155, setpoints.payloads, stops_of(setpoints)), 140, limits)
     assert isinstance(second, Commitment)
-    assert second.splices == (120, 150)
-    assert second.last == 150 + len(setpoints.payloads) - 1
-    assert further.starts[1:] == (1.36, 1.66)
+    assert second.splices == (120, 155)
+    assert second.last == 155 + len(setpoints.payloads) - 1
+    assert further.starts[1:] == pytest.approx((1.205, 1.555))
 
 
 def test_what_is_flown_before_a_splice_far_ahead_stays(flown, committed, limits):
     """Of setpoints so far behind that no vehicle is there any more, but not of those between now and the splice."""
-    _, setpoints = continued(flown, 300, [[-0.4, 2.0, 1.0]], limits)
+    _, setpoints = continued(flown, committed, 300, [[-0.4, 2.0, 1.0]], limits)
     for now in (20, 150, 290):
         new = splice(committed, propose(committed, 300, setpoints.payloads, stops_of(setpoints)), now, limits)
         assert new.first == max(now - KEPT_BEHIND, 0)
@@ -363,7 +365,7 @@ def test_once_warmed_up_a_pilot_compiles_nothing(committed, spliced, tmp_path):
 def test_random_splices_are_flown_without_a_jump_or_refused(flown, committed, limits, number, ahead, points):
     """Whatever continues the flight: what is committed ends at rest inside the space and never jumps."""
     try:
-        joined, setpoints = continued(flown, number, points, limits)
+        joined, setpoints = continued(flown, committed, number, points, limits)
     except (InfeasibleError, InputError):  # no such plan: nothing to propose
         return
     proposal = propose(committed, number, setpoints.payloads, stops_of(setpoints))

@@ -2,7 +2,7 @@
 
 All of it may be certified, or its beginning alone, with the stop behind that: what a pilot is bound to then ends at
 rest too, and takes as little time to certify as the beginning is short. More of the flight replaces the stop before the
-vehicle gets there. What is simulated of a beginning may go on beside, while what follows on it is planned already.
+vehicle gets there. The first setpoint is the committed one, to the byte: it was certified with its own look-ahead.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,15 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.air.background import Check, background_checks
 from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.setpoints.commitment import left_of
 from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, check_setpoints, encode_trajectory
-from cfplan.flight.setpoints.packets import FullStateSetpoints
+from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
 from cfplan.flight.setpoints.stops import DURATION, encode_stops, rest_behind
 from cfplan.flight.telemetry import Triple
-from cfplan.preparation.beside import Pending, Work, beside
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
@@ -39,115 +39,82 @@ class EndsBadlyError(InfeasibleError):
     """After link loss or a gap the vehicle would end outside the walls, or turn over."""
 
 
-class UnfoundedError(Exception):
-    """What a flight goes on from has not passed what was simulated of it meanwhile."""
-
-
-class Simulated:
-    """The simulated vehicle at each setpoint of a flight; of the last ones it may be simulated beside still."""
-
-    def __init__(self, last: NDArray | Pending, before: NDArray | None = None):
-        """Join the snapshots before, (L, K, 31) for each motor lag, and the last, (L, N, 31), which may be to come."""
-        self.coming = None if isinstance(last, np.ndarray) else last  # what raises where they do not pass
-        self._last, self._before = last, before
-
-    @property
-    def snapshots(self) -> NDArray:
-        """Return (L, K + N, 31), waiting for them if need be. Raises UnfoundedError where the last do not pass."""
-        if not isinstance(self._last, np.ndarray):
-            try:
-                self._last = np.asarray(self._last.result())
-            except Exception as error:
-                raise UnfoundedError from error
-        if self._before is not None:
-            self._last, self._before = np.concatenate([self._before, self._last], axis=1), None
-        return self._last
-
-    def behind(self, before: NDArray) -> "Simulated":
-        """Return the same behind others, (L, K, 31)."""
-        return Simulated(self._last, before)
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CertifiedFlight:
     """Setpoints that end at rest, a stop from each, and the simulated vehicle at each."""
 
     payloads: NDArray  # (N, 29) uint8
     stops: NDArray  # (N, M, 29) uint8
-    simulated: Simulated
+    snapshots: NDArray  # (L, N, 31), the simulated vehicle at each setpoint, for each motor lag
     following: int | None  # how many of the setpoints follow the motion, before the stop; None where all do
     rest: tuple[Triple, float] | None = None  # m, rad: place and yaw where that stop rests
 
     @property
-    def snapshots(self) -> NDArray:
-        """Return (L, N, 31), the simulated vehicle at each setpoint, as Simulated.snapshots."""
-        return self.simulated.snapshots
+    def ending(self) -> int:
+        """Return how many of the stops, the last ones, are what is left of the stop before them."""
+        return 0 if self.following is None else len(self.payloads) - self.following - 1
 
 
-def certify_whole(flown: JoinedTrajectory, limits: Limits, starts: NDArray | None) -> CertifiedFlight:
-    """Certify all of a flight like a plan before take-off; it goes on from snapshots, (L, 31), or from hover.
+@dataclass(frozen=True, slots=True, eq=False)
+class Onward:
+    """A motion that goes on from a setpoint."""
+
+    motion: JoinedTrajectory  # its clock is 0 at that setpoint
+    starts: NDArray | None = None  # (L, 31) the simulated vehicle there, for each motor lag; None: it hovers
+    committed: NDArray | None = None  # (29,) uint8, that setpoint as it is committed; None where none is
+
+    def encoded(self, limits: Limits, count: int | None = None) -> EncodedFlight:
+        """Return its setpoints, the first of which is the committed one; so many at most, or all."""
+        encoded = encode_trajectory(self.motion, gains=gains_under(limits), space=limits.space, count=count)
+        if self.committed is None:
+            return encoded
+        payloads = encoded.payloads.copy()
+        payloads[0] = self.committed
+        return replace(encoded, payloads=payloads, decoded=decode(payloads))
+
+    def to_check(self, encoded: EncodedFlight) -> EncodedFlight:
+        """Return the setpoints that are made of this motion: all but the committed one."""
+        return encoded if self.committed is None else _rows(encoded, slice(1, None))
+
+
+def certify_whole(onward: Onward, limits: Limits) -> CertifiedFlight:
+    """Certify all of a flight like a plan before take-off.
 
     Raises EndsBadlyError or NotCertifiedError where it does not pass.
     """
-    encoded = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
-    believed = None if starts is None else as_believed(starts, limits)
+    encoded, motion = onward.encoded(limits), onward.motion
+    believed = None if onward.starts is None else as_believed(onward.starts, limits)
 
     def check() -> None:
-        check_bytes(encoded, flown, limits.plan)
-        dry_run(encoded, flown, limits.airframe, limits.flight, snapshot=believed).require_passed()
+        check_bytes(onward.to_check(encoded), motion, limits.plan)
+        dry_run(encoded, motion, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    stops, lost = _certified(encoded, encoded.payloads, limits, starts, check)
-    return CertifiedFlight(encoded.payloads, stops, Simulated(lost.snapshots), None)
+    stops, lost = _certified(encoded, encoded.payloads, limits, onward.starts, check)
+    return CertifiedFlight(encoded.payloads, stops, lost.snapshots, None)
 
 
-def certify_beginning(
-    flown: JoinedTrajectory,
-    following: int,
-    limits: Limits,
-    starts: NDArray,
-    *,
-    foresee: bool = True,
-    encoded: EncodedFlight | None = None,
-) -> CertifiedFlight:
-    """Certify so many setpoints of a flight, and the stop behind them; all of it where that is hardly more.
+def certify_beginning(onward: Onward, following: int, limits: Limits, *, foresee: bool = True) -> CertifiedFlight:
+    """Certify so many setpoints of a flight in motion, and the stop behind them; all of it where that is hardly more.
 
     As certify_whole(). With `foresee`, an estimate of link loss in all of the flight counts besides: what it says to
-    end outside by far is refused before any of it is flown; without, setpoints that are `encoded` already, as many as
-    encoded_for() says, are not encoded again.
+    end outside by far is refused before any of it is flown.
     """
-    if following + STOP >= flown.duration * RATE:
-        return certify_whole(flown, limits, starts)
+    if following + STOP >= onward.motion.duration * RATE:
+        return certify_whole(onward, limits)
+    starts = onward.starts
+    assert starts is not None
     foresee = foresee and not limits.link_loss.only_warn
-    if encoded is None or foresee:
-        encoded = encode_trajectory(
-            flown, gains=gains_under(limits), space=limits.space, count=None if foresee else encoded_for(following)
-        )
+    encoded = onward.encoded(limits, None if foresee else following + STOP)  # stops lead half as far on
     foreseen = [partial(foresee_link_loss, encoded.payloads, limits, starts)] if foresee else []
     beginning = _Beginning.of(encoded, following)
 
     def check() -> None:
-        check_setpoints(beginning.encoded, flown, limits.plan)
-        _rehearse(beginning.payloads, limits, starts)
+        check_setpoints(onward.to_check(beginning.encoded), onward.motion, limits.plan)
+        believed = as_believed(starts, limits)
+        rehearse_setpoints(beginning.payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
     stops, lost = _certified(beginning.encoded, beginning.payloads, limits, starts, check, beginning.motion, foreseen)
-    return beginning.certified(stops, Simulated(lost.snapshots))
-
-
-def certify_meanwhile(
-    flown: JoinedTrajectory, following: int, limits: Limits, starts: Callable[[], NDArray], encoded: EncodedFlight
-) -> CertifiedFlight:
-    """Certify the beginning of a flight like certify_beginning() without `foresee`; simulations go on beside.
-
-    `starts` is asked for the snapshots that they go on from once there is nothing else to do. They raise what does not
-    pass in them where their result is asked for.
-    """
-    if following + STOP >= flown.duration * RATE:
-        return certify_whole(flown, limits, starts())
-    beginning = _Beginning.of(encoded, following)
-    stops = _stops_along(beginning.encoded, beginning.motion, limits)
-    check_setpoints(beginning.encoded, flown, limits.plan)
-    work = partial(_simulate, beginning.payloads, beginning.encoded, stops, limits, starts())
-    return beginning.certified(stops, Simulated(beside().begin(work)[0]))
+    return beginning.certified(stops, lost.snapshots)
 
 
 class _Beginning(NamedTuple):
@@ -161,36 +128,31 @@ class _Beginning(NamedTuple):
 
     @classmethod
     def of(cls, encoded: EncodedFlight, following: int) -> "_Beginning":
-        """Return it, from the setpoints of a flight, at least as many as encoded_for() says."""
-        motion, gains, space = _first(encoded.motion, encoded_for(following)), encoded.gains, encoded.space
+        """Return it, from the setpoints of a flight, as many as its stops lead on at least."""
+        motion, gains, space = _motion_rows(encoded.motion, slice(following + STOP)), encoded.gains, encoded.space
         stop = encode_stops(motion, RATE, rows=np.array([following]), gains=gains, space=space)[0]
         hovering = np.repeat(stop[-1:], BEHIND - len(stop), axis=0)
         payloads = np.concatenate([encoded.payloads[:following], stop, hovering])
-        begun = _first_rows(encoded, following + 1)
+        begun = _rows(encoded, slice(following + 1))
         return cls(payloads, begun, motion, stop, rest_behind(motion, following, RATE))
 
-    def certified(self, stops: NDArray, simulated: Simulated) -> CertifiedFlight:
+    def certified(self, stops: NDArray, snapshots: NDArray) -> CertifiedFlight:
         """Return it certified, with the stops from its setpoints before the stop, (K, M, 29)."""
         behind = left_of(self.stop, BEHIND - 1)
         following = len(stops) - 1
-        return CertifiedFlight(self.payloads, np.concatenate([stops, behind]), simulated, following, self.rest)
+        return CertifiedFlight(self.payloads, np.concatenate([stops, behind]), snapshots, following, self.rest)
 
 
-def encoded_for(following: int) -> int:
-    """Return how many setpoints of a flight are encoded, where so many are to be certified."""
-    return following + STOP  # stops lead half as far on
-
-
-def _first_rows(encoded: EncodedFlight, count: int) -> EncodedFlight:
-    """Return the first setpoints of a flight."""
+def _rows(encoded: EncodedFlight, rows: slice) -> EncodedFlight:
+    """Return some of the setpoints of a flight."""
     return replace(
-        encoded, times=encoded.times[:count], payloads=encoded.payloads[:count], decoded=_first(encoded.decoded, count),
-        motion=_first(encoded.motion, count),
+        encoded, times=encoded.times[rows], payloads=encoded.payloads[rows],
+        decoded=_motion_rows(encoded.decoded, rows), motion=_motion_rows(encoded.motion, rows),
     )  # fmt: skip
 
 
-def _first(setpoints: FullStateSetpoints, count: int) -> FullStateSetpoints:
-    return FullStateSetpoints(*(getattr(setpoints, name)[:count] for name in FullStateSetpoints.__slots__))
+def _motion_rows(setpoints: FullStateSetpoints, rows: slice) -> FullStateSetpoints:
+    return FullStateSetpoints(*(getattr(setpoints, name)[rows] for name in FullStateSetpoints.__slots__))
 
 
 def _certified(
@@ -200,7 +162,7 @@ def _certified(
     starts: NDArray | None,
     check: Callable[[], None],
     motion: FullStateSetpoints | None = None,
-    foreseen: Sequence[Work] = (),
+    foreseen: Sequence[Check] = (),
 ) -> tuple[NDArray, LinkLossMoments]:
     """Return a stop from each setpoint of `encoded`, and link loss of `payloads`, which begin with those setpoints.
 
@@ -209,7 +171,7 @@ def _certified(
     """
 
     # What is mostly compiled loops goes on beside what is mostly Python: two threads of that would hinder each other.
-    losing, *others = beside().begin(
+    losing, *others = background_checks().begin(
         partial(link_loss_at_walls, payloads, limits, starts=starts),
         partial(meet_gaps, payloads, limits, starts),
         *foreseen,
@@ -238,24 +200,6 @@ def _stops_along(encoded: EncodedFlight, motion: FullStateSetpoints, limits: Lim
     stops, passed = encode_certified_stops(motion, limits, RATE, encoded.gains, encoded.space, count=count)
     passed.require(limits)
     return stops
-
-
-def _simulate(payloads: NDArray, encoded: EncodedFlight, stops: NDArray, limits: Limits, starts: NDArray) -> NDArray:
-    """Return the simulated vehicle at each setpoint, (L, N, 31), where all that is simulated of them passes.
-
-    `payloads` begin with what is `encoded`, with these stops. Raises as certify_whole() does.
-    """
-    lost = link_loss_at_walls(payloads, limits, starts=starts)
-    _require_all_inside(encoded, stops, limits, lost)
-    _rehearse(payloads, limits, starts)
-    meet_gaps(payloads, limits, starts)
-    return lost.snapshots
-
-
-def _rehearse(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
-    """Raise NotCertifiedError where the dry run does not pass."""
-    believed = as_believed(starts, limits)
-    rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
 
 def _require_all_inside(encoded: EncodedFlight, stops: NDArray, limits: Limits, lost: LinkLossMoments) -> None:

@@ -1,4 +1,4 @@
-"""Work beside: a thread's and a process's answers are the same, and the death of the process changes nothing."""
+"""Background checks: a thread and a process answer alike, and the death of the process changes nothing."""
 
 import multiprocessing
 import os
@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from waiting import until
 
+from cfplan.air.background import ChecksByProcess, ChecksByThread
 from cfplan.errors import InfeasibleError
-from cfplan.preparation.beside import BesideByProcess, BesideByThread
 
 PARENT = """
 import multiprocessing
 from functools import partial
-from cfplan.preparation.beside import BesideByProcess
+from cfplan.air.background import ChecksByProcess
 if __name__ == "__main__":
-    other = BesideByProcess(int)
+    other = ChecksByProcess(int)
     [answer] = other.begin(partial(int, 7))
     answer.result()
     [child] = multiprocessing.active_children()
@@ -36,19 +36,14 @@ def fill(value: float, count: int) -> np.ndarray:
     return np.full(count, value)
 
 
-def append(file: Path, text: str) -> None:
-    with file.open("a") as out:
-        out.write(text)
-
-
-@pytest.fixture(params=[BesideByThread, partial(BesideByProcess, int)], ids=["thread", "process"])
+@pytest.fixture(params=[ChecksByThread, partial(ChecksByProcess, int)], ids=["thread", "process"])
 def other(request):
     return request.param()
 
 
 def children():
-    """Return the processes beside; other tests may have left others."""
-    return [child for child in multiprocessing.active_children() if child.name == "beside"]
+    """Return the processes that do checks; other tests may have left others."""
+    return [child for child in multiprocessing.active_children() if child.name == "checks"]
 
 
 def the_child():
@@ -64,7 +59,7 @@ def _no_process_stays():
         child.join()
 
 
-def test_each_piece_of_work_has_its_answer_whichever_is_asked_for_first(other):
+def test_each_check_has_its_answer_whichever_is_asked_for_first(other):
     first, refused, last = other.begin(partial(fill, 1.5, 4), partial(refuse, "there"), partial(int, 3))
     assert last.result() == 3
     with pytest.raises(InfeasibleError) as error:
@@ -73,17 +68,6 @@ def test_each_piece_of_work_has_its_answer_whichever_is_asked_for_first(other):
     assert isinstance(refused.exception(), InfeasibleError)
     assert first.exception() is None
     np.testing.assert_array_equal(first.result(), np.full(4, 1.5))
-
-
-def test_whether_work_is_done_is_told_without_waiting(other, tmp_path):
-    goes_on = tmp_path / "goes on"
-    first, second = other.begin(partial(until, goes_on.exists), partial(refuse, "there"))
-    assert not first.done()
-    assert not second.done()
-    goes_on.touch()
-    assert until(second.done)
-    assert first.done()
-    assert isinstance(second.exception(), InfeasibleError)
 
 
 def test_answers_that_nobody_asks_for_do_not_hold_up_the_next(other):
@@ -95,42 +79,8 @@ def test_answers_that_nobody_asks_for_do_not_hold_up_the_next(other):
     assert answer.result() == 1_000_000
 
 
-def test_what_is_done_for_nobody_changes_no_answer(other):
-    other.wake()  # nothing was done yet
-    for value in range(3):
-        [answer] = other.begin(partial(fill, value, 4))
-        np.testing.assert_array_equal(answer.result(), np.full(4, value))
-        other.wake()
-        other.wake()
-
-
-def test_waking_does_what_was_done_last_once_more(tmp_path):
-    other, seen = BesideByProcess(int), tmp_path / "seen"
-    for number in (1, 2):
-        [answer] = other.begin(partial(append, seen, str(number)))
-        answer.result()
-    other.wake()
-    assert until(lambda: seen.read_text() == "122")
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="processors cannot be chosen on this system")
-def test_the_process_keeps_off_the_processor_that_asks():
-    processors = os.sched_getaffinity(0)
-    if len(processors) < 2:
-        pytest.skip("one processor alone")
-    other = BesideByProcess(int)
-    try:
-        for mine in processors:
-            os.sched_setaffinity(0, {mine})
-            [answer] = other.begin(partial(os.sched_getaffinity, 0))
-            assert answer.result() == processors - {mine}
-    finally:
-        os.sched_setaffinity(0, processors)
-    assert os.sched_getaffinity(0) == processors
-
-
-def test_where_the_process_has_died_the_work_is_done_here():
-    other = BesideByProcess(int)
+def test_where_the_process_has_died_checks_are_done_here():
+    other = ChecksByProcess(int)
     [answer] = other.begin(partial(os.getpid))
     child = the_child()
     assert answer.result() == child.pid

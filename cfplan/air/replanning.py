@@ -1,0 +1,260 @@
+"""Replanning: from a timeline and a request to a certified proposal for the pilot.
+
+The motion changes as soon as the proposal can be in time. Where no path leads on from there, or where link loss or a
+gap would end badly, later joints and lower speeds are tried; and at last a plan from rest, behind a stop.
+"""
+
+import itertools
+import math
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import TypedDict
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cfplan.air.certifying import EndsBadlyError, certify_beginning, certify_whole
+from cfplan.air.requests import PathRequest, Wish
+from cfplan.air.stopping import halt
+from cfplan.air.timeline import Replanned, Timeline, joint_of
+from cfplan.errors import CfplanError, InfeasibleError, InputError, NotCertifiedError
+from cfplan.flight.setpoints.commitment import propose, spliced
+from cfplan.geometry.min_snap import MIN_SPACING, spaced
+from cfplan.planning.continuation import Continuation, NoWayError, check_waypoints, continue_plan, plan_from_rest
+from cfplan.safety.limits import Limits
+
+SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
+JOINT_DELAYS = (0, 5, 15, 35)  # setpoints by which the vehicle flies on before it turns off, one after another
+SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
+PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
+
+
+class PlanOptions(TypedDict):
+    """What continue_plan() takes by name."""
+
+    yaw_angle: float  # rad
+    speed: float  # m/s
+    leave_room: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplanSpec:
+    """What a new plan is to do."""
+
+    points: NDArray  # (K, 3) m, waypoints
+    keep: bool  # whether they follow those ahead; else they replace them
+    yaw_angle: float  # rad, to which the vehicle turns
+    part: int | None = None  # setpoints to commit at once, with the stop behind them; None: all
+    speed: float = math.inf  # m/s, at most
+    leave_room: bool = True  # to limits, as in continue_plan()
+
+    @property
+    def options(self) -> "PlanOptions":
+        """Return what continue_plan() takes by name."""
+        return {"yaw_angle": self.yaw_angle, "speed": self.speed, "leave_room": self.leave_room}
+
+
+def answer_request(
+    timeline: Timeline, request: PathRequest, splice: int, limits: Limits, part: int | None = None
+) -> Replanned | Timeline:
+    """Return the proposal that does what is asked for from setpoint `splice` on; `part` as in replan().
+
+    Where nothing need be proposed, the timeline from now on. Raises a CfplanError where no plan does it.
+    """
+    yaw = _final_yaw(timeline)
+    match request.wish:
+        case Wish.STOP:
+            return halt(timeline, splice, limits)
+        case Wish.SLOWER | Wish.FASTER:
+            now = min(timeline.speed, limits.plan.speed)
+            slowed = timeline.slowed_to(now * PACE if request.wish is Wish.SLOWER else now / PACE)
+            nothing_ahead = timeline.stopping and not len(timeline.left)
+            if nothing_ahead or joint_of(splice) >= timeline.ends:
+                return slowed
+            return _search(slowed, splice, ReplanSpec(np.empty((0, 3)), True, yaw, part), limits)
+    keep = request.wish is Wish.EXTEND
+    if (bound := bound_already(timeline, splice, request.waypoints, limits, keep=keep)) is not None:
+        return bound
+    try:
+        return replan(timeline, splice, request.waypoints, limits, keep=keep, yaw_angle=yaw, part=part)
+    except (NoWayError, EndsBadlyError, NotCertifiedError):
+        if not keep:
+            with suppress(CfplanError):
+                return replan_behind_stop(timeline, splice, request.waypoints, limits, yaw_angle=yaw, part=part)
+        raise
+
+
+def replan(
+    timeline: Timeline,
+    splice: int,
+    waypoints: ArrayLike,
+    limits: Limits,
+    *,
+    keep: bool = False,
+    yaw_angle: float = 0.0,
+    part: int | None = None,
+) -> Replanned:
+    """Return the proposal to leave a timeline at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
+
+    The motion changes there, or a little later where it cannot do so at once. With `keep`, the waypoints follow those
+    that are ahead, and the motion changes only once that to them has begun; else they replace them. Waypoints closer
+    than MIN_SPACING to the one before, or to where the plan begins, are left out. Where the vehicle rests by then, the
+    plan begins from rest. Where link loss or a gap would end badly, the vehicle flies slower. So many setpoints are
+    proposed as `part` says, and the stop behind them; without it, all.
+
+    Raises:
+        InputError: what is given are no waypoints.
+        InfeasibleError: no plan leads through them from there, or link loss would end outside the walls.
+        NotCertifiedError: the plan, its bytes, a stop, a gap or the dry run does not pass.
+    """
+    points = np.asarray(waypoints, dtype=float)
+    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
+        raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint="give rows of x, y, z in metres")
+    check_waypoints(points, limits)
+    return _search(timeline, splice, ReplanSpec(points, keep, yaw_angle, part), limits)
+
+
+def replan_behind_stop(
+    timeline: Timeline,
+    splice: int,
+    waypoints: ArrayLike,
+    limits: Limits,
+    *,
+    yaw_angle: float = 0.0,
+    part: int | None = None,
+) -> Replanned:
+    """Return the proposal to go through waypoints, (K, 3) m, from rest, behind the stop from setpoint `splice` on.
+
+    For where no way leads there from the motion. The `stop` is to be proposed first, unless the vehicle stops as soon
+    anyway. Raises as replan() and halt() do; then nothing is to be proposed.
+    """
+    stop = halt(timeline, splice, limits)
+    resting = stop if isinstance(stop, Timeline) else stop.accepted(spliced(timeline.commitment, stop.proposal, splice))
+    begins = max(splice, resting.stops[-1][1] if resting.stops else 0)
+    if isinstance(stop, Replanned) and bound_already(resting, begins, waypoints, limits) is not None:
+        return stop
+    made = replan(resting, begins, waypoints, limits, yaw_angle=yaw_angle, part=part)
+    return made if isinstance(stop, Timeline) else replace(made, stop=stop)
+
+
+def next_part(timeline: Timeline, splice: int, limits: Limits, part: int) -> Replanned | Timeline:
+    """Return the proposal of the next `part`, setpoints, of a plan that is committed in parts, from `splice` on.
+
+    Where that would end badly, the vehicle flies slower, from soon on if that helps, else from the part on. Where it
+    stops by then, as this comes too late, it goes on from rest. Where all was flown, the timeline, and nothing need be
+    proposed. Raises as replan() does; then the vehicle rests behind the part before.
+    """
+    timeline = timeline.for_plans_from(splice, limits)
+    rest_of_it = ReplanSpec(np.empty((0, 3)), True, _final_yaw(timeline), part)
+    if timeline.part_ends is not None:
+        ahead = timeline.part_ends - 1  # what is before that is committed already
+        with suppress(EndsBadlyError, NotCertifiedError):
+            made = certify_beginning(timeline.onward(ahead, timeline.motion), part, limits, foresee=False)
+            proposal = propose(timeline.commitment, ahead, made.payloads, made.stops, made.ending, goes_on=True)
+            return Replanned(proposal, timeline.with_certified(ahead, made), None, joint_of(ahead))
+        with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
+            return _search(timeline, min(splice + SOON, ahead), rest_of_it, limits, slower=True)
+        splice = ahead
+    return _search(timeline, splice, rest_of_it, limits) if timeline.unfinished else timeline
+
+
+def bound_already(
+    timeline: Timeline, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False
+) -> Timeline | None:
+    """Return the timeline if by it the vehicle already flies this request to replan(), or rests there; else None."""
+    points = np.asarray(waypoints, dtype=float).reshape(-1, 3)
+    if not len(points):  # nothing was asked for
+        return None
+    resting = timeline.for_plans_from(splice, limits)
+    splice, _ = resting.leaving(splice, keep=keep)
+    joint = joint_of(splice)
+    here, last = resting.motion.at(joint).position, resting.motion.at(resting.ends).position
+    s = float(resting.motion.trajectories[-1].s_at(max(joint - resting.motion.starts[-1], 0.0)))
+    unreached = resting.ahead[np.array(resting.reached) > s]
+    ahead = spaced(np.concatenate([here[None], unreached, last[None], resting.left]))
+    if keep:
+        return timeline if len(spaced(np.concatenate([ahead[-1:], points]))) == 1 else None
+    wanted = spaced(np.concatenate([here[None], points]))
+    if wanted.shape == ahead.shape and (np.linalg.norm(wanted - ahead, axis=1) < MIN_SPACING).all():
+        return timeline
+    return resting.cut_short(limits, going_on=False) if len(wanted) == 1 and joint >= resting.ends else None
+
+
+def _search(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits, *, slower: bool = False) -> Replanned:
+    """Return the first certified plan among later joints and lower speeds; with `slower`, at lower speeds alone."""
+    splice, _ = timeline.for_plans_from(splice, limits).leaving(splice, keep=spec.keep)
+    fastest = min(timeline.speed, limits.plan.speed)
+    speeds = [*([] if slower else [fastest]), *(speed for speed in SLOWER if speed < fastest)]
+    refused: InfeasibleError | None = None
+    for speed in speeds:
+        for leave_room, delay in itertools.product((True, False), JOINT_DELAYS):
+            if delay and timeline.part_ends is not None and splice + delay >= timeline.part_ends:
+                continue
+            try:
+                return _replan_at(timeline, splice + delay, replace(spec, speed=speed, leave_room=leave_room), limits)
+            except EndsBadlyError as error:
+                refused = error
+                break
+            except NoWayError as error:
+                refused = refused or error
+                if joint_of(splice + delay) > timeline.ends:
+                    break
+        else:
+            break  # nor does a path lead on more slowly
+    if refused is None:
+        raise InfeasibleError("it flies as slowly as may be", where="request", hint="nothing need be flown")
+    raise refused
+
+
+def _replan_at(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits) -> Replanned:
+    """Return the certified plan that leaves a timeline at a setpoint."""
+    timeline = timeline.for_plans_from(splice, limits)
+    splice, left = timeline.leaving(splice, keep=spec.keep)
+    joint = joint_of(splice)
+    points, made = _planned(timeline, joint, left, spec, limits)
+    onward = timeline.onward(splice, timeline.motion.continued(joint, made.plan.trajectory))
+    part = spec.part
+    passed = certify_whole(onward, limits) if part is None else certify_beginning(onward, part, limits)
+    motion = timeline.motion.continued(joint, made.plan.trajectory)
+    later = replace(timeline, motion=motion, ahead=points, reached=made.reached).with_certified(splice, passed)
+    proposal = propose(timeline.commitment, splice, passed.payloads, passed.stops, passed.ending)
+    return Replanned(proposal, later, made.plan, joint)
+
+
+def _planned(
+    timeline: Timeline, joint: float, left: int, spec: ReplanSpec, limits: Limits
+) -> tuple[NDArray, Continuation]:
+    """Return the waypoints of a plan, (K, 3) m, and the plan that leaves a trajectory of the timeline at a joint, s."""
+    leave, trajectory = joint - timeline.motion.starts[left], timeline.motion.trajectories[left]
+    if leave >= trajectory.duration:
+        place = timeline.motion.at(joint)
+        kept = [timeline.left] if spec.keep else []
+        points = spaced(np.concatenate([place.position[None], *kept, spec.points]))
+        if len(points) < 2:
+            raise InfeasibleError("the vehicle rests there already", where="request", hint="nothing need be flown")
+        return points[1:], plan_from_rest(points, limits, yaw_angle=float(place.yaw), speed=spec.speed)
+    if not spec.keep:
+        state = trajectory.at(leave)
+        points = spaced(np.concatenate([state.position[None], spec.points]))[1:]
+        if not len(points):
+            raise NoWayError(
+                f"the vehicle passes it at {float(np.linalg.norm(state.velocity)):.2f} m/s",
+                where="waypoint 1",
+                hint="stop first, then ask for it again",
+            )
+        return points, continue_plan(trajectory, leave, points, limits, **spec.options)
+    ahead = timeline.still_ahead(leave)
+    stays = timeline.ahead[ahead].reshape(-1, 3)
+    begin = stays[-1:] if ahead else trajectory.at(leave).position[None]
+    points = np.concatenate([stays, spaced(np.concatenate([begin, spec.points]))[1:]])
+    if not len(points):
+        raise InfeasibleError(
+            "the last waypoint is all but reached", where="request",
+            hint="ask for waypoints instead; they are flown so",
+        )  # fmt: skip
+    reached = [timeline.reached[number] for number in ahead]
+    return points, continue_plan(trajectory, leave, points, limits, reached=reached, **spec.options)
+
+
+def _final_yaw(timeline: Timeline) -> float:
+    return float(timeline.motion.at(timeline.ends).yaw)

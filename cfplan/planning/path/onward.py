@@ -1,0 +1,161 @@
+"""Paths on which a vehicle goes on: chosen like those from rest, in the few milliseconds that there are in flight.
+
+A path begins in the state of a joint, with time as s, or at rest. Two descents choose it: one with soft limits, which
+may begin with any path (soft_limits.py), and a few steps of one along the gradient of the flight time (cost.py). What
+cannot be flown is descended again with limits that are less soft; and again from a path that brakes first.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.deadline import NEVER
+from cfplan.geometry.waypoints import Region
+from cfplan.geometry.yaw import YawMode
+from cfplan.planning.path.cost import Course, PathCost
+from cfplan.planning.path.descent import descend
+from cfplan.planning.path.detour import with_corners
+from cfplan.planning.path.room import Room
+from cfplan.planning.path.soft_limits import SoftLimits
+from cfplan.planning.path.variables import Knots, variables_of, with_points_between
+from cfplan.safety.limits import Limits
+from cfplan.vehicle.profile import BoundaryState
+from cfplan.vehicle.trajectory import Trajectory
+
+WEIGHTS = (1.0, 10.0, 100.0)  # of what exceeds soft limits, one descent after another
+SOFT_STEPS, SOFT_TOLERANCE = 40, 2e-3  # of the descents with soft limits; of the cost, by which steps improve it
+STEPS, TOLERANCE = 2, 2e-3  # of those along the gradient of the flight time; four more gain 0.5 % in half as long again
+_GENTLY = 0.7  # of the limit on acceleration, at which the vehicle brakes and gains speed where a descent begins
+_SOON = 0.1  # s, the shortest segment where a descent begins
+_SAME = 1e-9  # of the end of a path, within which two of its places are one
+_INSIDE = 0.05  # m from the margin, at which points lie where a descent begins
+_OUTSIDE = 1e3  # s/m³, weight of the square of what leaves the room
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Departure:
+    """The state in which a path begins."""
+
+    position: NDArray  # (3,) m
+    motion: NDArray | None = None  # (5, 3) γ to γ'''' with time as s; None at rest
+    state: BoundaryState | None = None  # likewise
+    yaw: YawMode = YawMode.FIXED
+    yaw_angle: float = 0.0  # rad, to which the vehicle turns along the path
+
+    @property
+    def velocity(self) -> NDArray:
+        """Return it, (3,) m/s."""
+        return np.zeros(3) if self.motion is None else self.motion[1]
+
+
+def onward_paths(starts: list[Knots], departure: Departure, limits: Limits, speed: float) -> Iterator[Knots]:
+    """Yield paths from a departure, the fastest first; `starts` are where descents may begin, those ahead first.
+
+    `speed`, m/s, is a limit besides. What is yielded may still leave the room, or exceed a limit from the start on.
+    """
+    room = Room(limits.space, starts[0].points[starts[0].waypoint], None)
+    if limits.space.obstacles and not limits.link_loss.only_warn:
+        room = room.to_come_down()
+    course = Course((None,) * len(starts[0].waypoint), departure.yaw, departure.yaw_angle, departure.state)
+    begun = max(speed, float(np.linalg.norm(departure.velocity)))  # a path along which it brakes at once turns too fast
+    soft = [_soft(knots, course.regions, limits, room, begun) for knots in starts]
+    firsts = [np.append(0.0, each.variables.first) for each in soft]
+    costs = [each(first)[0] for each, first in zip(soft, firsts, strict=True)]
+    for number in np.argsort(costs, kind="stable"):
+        each, x = soft[number], firsts[number]
+        for weight in WEIGHTS:
+            each.weight = weight
+            x = descend(each, x, NEVER, tolerance=SOFT_TOLERANCE, iterations=SOFT_STEPS).x
+            knots = each.knots(x)
+            if speed >= limits.plan.speed:
+                faster = _descended(knots, course, limits, room)
+                if faster is None:
+                    continue
+                yield faster
+            yield knots
+
+
+def _soft(knots: Knots, regions: tuple[Region, ...], limits: Limits, room: Room, speed: float) -> SoftLimits:
+    return SoftLimits(variables_of(knots, regions, 1, limits.space.margin), limits, room, min(speed, limits.plan.speed))
+
+
+def _descended(knots: Knots, course: Course, limits: Limits, room: Room) -> Knots | None:
+    """Return the path after some steps along the gradient of the flight time; None where it cannot be flown."""
+    variables = variables_of(knots, course.regions, 1, limits.space.margin)
+    cost = PathCost(course, limits, room, variables, NEVER, _OUTSIDE)
+    descended = descend(cost, variables.first, NEVER, tolerance=TOLERANCE, iterations=STEPS)
+    return None if descended.cost == np.inf else variables.knots(descended.x)
+
+
+def toward(departure: Departure, waypoints: NDArray, limits: Limits) -> list[Knots]:
+    """Return where descents begin to paths through waypoints, (K, 3) m: straight to them, and braking first."""
+    points, waypoint = with_corners(np.concatenate([departure.position[None], waypoints]), limits.space)
+    straight = Knots(_times(points, departure.velocity, limits), points, waypoint, departure.motion)
+    straight = _clipped(with_points_between(straight), limits)
+    if departure.motion is None:
+        return [straight]
+    times, points = straight.times.copy(), straight.points.copy()
+    braking = float(np.linalg.norm(departure.velocity)) / _gain(limits) + _SOON
+    points[1] = departure.position + departure.velocity * braking / 2
+    away = float(np.linalg.norm(points[2] - points[1]))
+    times[0], times[1] = braking, 1.5 * math.sqrt(away / _gain(limits)) + _SOON
+    return [straight, _clipped(straight._replace(times=times, points=points), limits)]
+
+
+def along(
+    trajectory: Trajectory, leave: float, reached: NDArray, departure: Departure, more: NDArray, limits: Limits
+) -> Knots:
+    """Return the knots of a path that lie ahead at `leave`, s, at the times at which they are flown.
+
+    `reached`, (K,), is s at the waypoints that stay; `more`, (J, 3) m, follow them. K + J is at least 1.
+    """
+    path, s = trajectory.path, float(trajectory.s_at(leave))
+    free = path.breaks[(path.breaks > s) & (path.breaks < reached.max(initial=s))]
+    free = free[(np.abs(free[:, None] - np.append(reached, s)) > _SAME * path.end).all(axis=1)]
+    places = np.sort(np.concatenate([[s], reached, free]))
+    is_waypoint = np.isin(places, np.append(reached, s))
+    times = trajectory.time_at(places)
+    # Points too near to one another would hardly shape the path between them.
+    apart = np.minimum(np.diff(times, prepend=-np.inf), np.diff(times, append=np.inf)) > _SOON / 2
+    kept = is_waypoint | apart
+    places, times, waypoint = places[kept], times[kept], np.flatnonzero(is_waypoint[kept])
+    knots = Knots(np.diff(times), path(places), waypoint, departure.motion)
+    knots.points[0] = departure.position
+    if not len(more):
+        return knots
+    points = np.concatenate([knots.points[-1:], more])
+    halves = (points[1:] + points[:-1]) / 2
+    points = np.stack([halves, points[1:]], axis=1).reshape(-1, 3)
+    new = np.repeat(_times(np.concatenate([knots.points[-1:], more]), np.zeros(3), limits), 2) / 2
+    rows = len(knots.points) + 1 + 2 * np.arange(len(more))
+    return Knots(
+        np.concatenate([knots.times, new]), np.concatenate([knots.points, points]), np.append(waypoint, rows),
+        departure.motion,
+    )  # fmt: skip
+
+
+def _gain(limits: Limits) -> float:
+    return _GENTLY * limits.plan.acceleration
+
+
+def _times(points: NDArray, velocity: NDArray, limits: Limits) -> NDArray:
+    """Return about how long each segment takes, (M,) s, the first one longer by what turning back takes."""
+    steps = np.diff(points, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    times = 2.0 * np.sqrt(lengths / limits.plan.acceleration) + 0.4 * lengths / limits.plan.speed
+    speed = float(np.linalg.norm(velocity))
+    if speed > 0.0:
+        times[0] += speed / limits.plan.acceleration * (1.0 - float(velocity @ steps[0]) / (speed * lengths[0]))
+    return times
+
+
+def _clipped(knots: Knots, limits: Limits) -> Knots:
+    """Return knots whose points between waypoints lie inside the walls."""
+    space = limits.space
+    low, high = np.array(space.low) + space.margin + _INSIDE, np.array(space.high) - space.margin - _INSIDE
+    points = np.clip(knots.points, low, high)
+    points[knots.waypoint] = knots.points[knots.waypoint]
+    return knots._replace(points=points)

@@ -1,0 +1,41 @@
+"""Motor commands as a vehicle logs them: PWM after battery compensation, and the shares of full command before it.
+
+The firmware turns a share of its full command into thrust, thrust by a cubic of its platform's propeller build into the
+motor's voltage, and that over the battery's into PWM. Firmware without compensation logs the shares themselves.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.vehicle.airframe import Airframe
+
+FULL_COMMAND = 65535  # of a motor, 16 bits
+_LEAST_VOLTAGE = 2.0  # V of the battery, below which the firmware turns the motors off
+_UNIQUE = 1.0 - 1e-6  # of the least thrust: rounding must not turn a motor off that runs at it
+_ROUNDS = 40  # of bisection: to 1e-11 V
+
+
+def command_shares(pwm: NDArray, battery_voltage: NDArray, airframe: Airframe) -> NDArray:
+    """Return the share of the full command, (N, 4), of motors whose PWM, (N, 4) 16 bits, was logged at (N,) V."""
+    share = np.asarray(pwm) / FULL_COMMAND
+    if not any(airframe.motor_curve):
+        return share
+    *cubic, full = airframe.motor_curve
+    thrust = np.polynomial.polynomial.polyval(share * np.asarray(battery_voltage)[:, None], cubic)
+    return np.where(share > 0.0, np.maximum(thrust, 0.0) / full, 0.0)
+
+
+def compensated_pwm(share: float, battery_voltage: float, airframe: Airframe) -> float:
+    """Return the PWM, 16 bits, by which a motor is given a share of the full command at a battery's voltage, V."""
+    if not any(airframe.motor_curve):
+        return share * FULL_COMMAND
+    *cubic, full = airframe.motor_curve
+    thrust = share * full
+    if thrust < _UNIQUE * airframe.motor_thrust_min or battery_voltage < _LEAST_VOLTAGE:
+        return 0.0
+    low, high = 0.0, 2.0 * battery_voltage
+    for _ in range(_ROUNDS):
+        middle = 0.5 * (low + high)
+        given = cubic[0] + middle * (cubic[1] + middle * (cubic[2] + middle * cubic[3]))
+        low, high = (middle, high) if given < thrust else (low, middle)
+    return min(low / battery_voltage, 1.0) * FULL_COMMAND
