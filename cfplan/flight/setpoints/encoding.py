@@ -26,6 +26,7 @@ from cfplan.flight.setpoints.rate_trade import (
     FIRMWARE_GAINS,
     AttitudeGains,
     harmless_rates,
+    held_against_air,
     trade_rates,
 )
 from cfplan.machine_code import njit
@@ -313,10 +314,11 @@ def check_motion(
     if len(others):
         raise _refused("the payload is no full state", payloads[others[0], 0], first + int(others[0]))
     decoded = decode(payloads)
-    position, velocity, acceleration, quaternion, body_rate = planned = [
-        np.array(getattr(motion, name), dtype=float, order="C") for name in FullStateSetpoints.__slots__
-    ]
-    harmless = harmless_rates(FullStateSetpoints(*planned), acceleration_ahead, gains, space)
+    harmless = harmless_rates(motion, acceleration_ahead, gains, space)
+    asked = held_against_air(motion, gains)
+    position, velocity, acceleration, quaternion, body_rate = (
+        np.array(getattr(asked, name), dtype=float, order="C") for name in FullStateSetpoints.__slots__
+    )
     compared, flown, attitude, rate = _made(
         decoded.acceleration, decoded.quaternion, decoded.body_rate, acceleration, quaternion, body_rate,
         gains.full_rate,
@@ -326,7 +328,8 @@ def check_motion(
     )
     if check >= 0:
         raise _refused(_FAULTS[check], value, first + row)
-    return replace(decoded, acceleration=flown, quaternion=attitude, body_rate=rate)
+    made = replace(decoded, acceleration=flown, quaternion=quaternion, body_rate=rate)
+    return replace(held_against_air(made, gains, -1.0), quaternion=attitude)
 
 
 # What _first_fault() checks, in its order; the value at fault follows.

@@ -8,8 +8,8 @@ and τ the age of the attitude that the controller believes,
     thrust     T = f · z
     body rate  ω = (ω_sent + K z × f / |f|) / (1 - K τ)        about body x and y; about z it is ω_sent
 
-where the denominator compensates for that age. For the bytes of a certified plan or stop, these values are the
-certified ones within TOLERANCES.
+less the rates that hold the body against the air, where the denominator compensates for that age. For the bytes of a
+certified plan or stop, these values are the certified ones within TOLERANCES.
 """
 
 import math
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import FIELD_PLACES, PAYLOAD_SIZE, QUATERNION_PLACE, decompressed
-from cfplan.flight.setpoints.rate_trade import ATTITUDE_AGE, FIRMWARE_GAINS, TRADED_RATE_MAX
+from cfplan.flight.setpoints.rate_trade import ATTITUDE_AGE, FIRMWARE_GAINS, TRADED_RATE_MAX, moment_rates
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import AT_MOST, QUANTITIES
@@ -71,6 +71,7 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
     _raise_by_runs(
         panel, words, _read_only(runs.reshape(len(runs), -1)), _read_only(before),
         runs.shape[1] if end is None else end, airframe.drag[0] / airframe.mass, FIRMWARE_GAINS.full_rate,
+        moment_rates(airframe),
     )  # fmt: skip
     worst = panel.reshape(_ROWS, _WIDTH).max(axis=1)
     high = worst[: of.MEASURES].copy()
@@ -116,8 +117,9 @@ def _read_only(array: NDArray) -> NDArray:
 
 @njit(error_model="numpy", fastmath=ROUNDING, allocates=False)
 def _raise_by_runs(
-    worst: NDArray, words: NDArray, runs: NDArray, before: NDArray, end: int, drag: float, full_rate: float
-) -> None:
+    worst: NDArray, words: NDArray, runs: NDArray, before: NDArray, end: int, drag: float, full_rate: float,
+    moment: tuple[float, float],
+) -> None:  # fmt: skip
     """Update the panel of running maxima, (_ROWS * _WIDTH,), with rows before `end` of all runs, (R, L * 29)."""
     for r in range(len(runs)):
         if r > 0 and _is_left_of(runs[r], runs[r - 1]):
@@ -129,7 +131,7 @@ def _raise_by_runs(
                 begin = max(end - LANES, 0)
                 lanes = end - begin
             _take_words(words, runs[r], before[r : r + SPAN], begin, lanes)
-            _raise_all(worst, words, lanes, drag, full_rate)
+            _raise_all(worst, words, lanes, drag, full_rate, moment)
             begin += lanes
 
 
@@ -180,14 +182,18 @@ def _word(run: NDArray, at: int) -> Any:
 
 
 @register_jitable(fastmath=ROUNDING)
-def _raise_all(worst: NDArray, words: NDArray, lanes: int, drag: float, full_rate: float) -> None:
+def _raise_all(
+    worst: NDArray, words: NDArray, lanes: int, drag: float, full_rate: float, moment: tuple[float, float]
+) -> None:
     lanes = min(lanes, _MOST)  # the compiler must see that no index overflows
     for n in range(lanes):
-        _raise_worst(worst, words, n, drag, full_rate)
+        _raise_worst(worst, words, n, drag, full_rate, moment)
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate: float) -> None:
+def _raise_worst(
+    worst: NDArray, words: NDArray, n: int, drag: float, full_rate: float, moment: tuple[float, float]
+) -> None:
     """Update the running maxima with one setpoint."""
     place, place_ahead = _triple(words, _PLACE, n), _triple(words, _PLACE, n + 1)
     velocity, velocity_ahead = _triple(words, _SPEED, n + SPAN), _triple(words, _SPEED, n + SPAN + 1)
@@ -203,7 +209,7 @@ def _raise_worst(worst: NDArray, words: NDArray, n: int, drag: float, full_rate:
     sent = x, y, z + GRAVITY
     scale, lean = full_rate / math.sqrt(dot(sent, sent)), cross(axis, sent)
     traded = scale * lean[0], scale * lean[1], scale * lean[2]
-    rate_x, rate_y, rate_z = _body_rate(traded, sent, words, n, full_rate)
+    rate_x, rate_y, rate_z = _body_rate(traded, sent, velocity, moment, words, n, full_rate)
     thrust = dot(axis, sent)
 
     _raise(worst, of.ACCELERATION, n, dot(acceleration, acceleration))
@@ -230,16 +236,29 @@ def _raise_place(worst: NDArray, axis: int, n: int, here: float, ahead: float, w
 
 
 @register_jitable(forceinline=True, fastmath=ROUNDING)
-def _body_rate(traded: Vector, sent: Vector, words: NDArray, n: int, full_rate: float) -> Vector:
-    """Return the body rates, rad/s, that a setpoint asks for; `traded` are those sent as a turn, in world axes."""
+def _body_rate(
+    traded: Vector,
+    sent: Vector,
+    velocity: Vector,
+    moment: tuple[float, float],
+    words: NDArray,
+    n: int,
+    full_rate: float,
+) -> Vector:
+    """Return the body rates, rad/s, that a setpoint makes the vehicle fly; `traded` are those sent as a turn.
+
+    Those that hold the body against the air, `moment` for each m/s, are taken off; vectors are in world axes.
+    """
     cos, sin = _heading(words, n)
     a, b, c = sent
     left = -c * sin, c * cos, a * sin - b * cos  # the controller's y axis, and x is left × sent
-    about_x = dot(traded, cross(left, sent)) / math.sqrt(dot(left, left) * dot(sent, sent))
-    about_y = dot(traded, left) / math.sqrt(dot(left, left))
+    ahead = cross(left, sent)
+    across, along = 1.0 / math.sqrt(dot(left, left)), 1.0 / math.sqrt(dot(ahead, ahead))
+    about_x, about_y = dot(traded, ahead) * along, dot(traded, left) * across
     sent_x, sent_y, about_z = _triple(words, _RATE, n)
     believed = 1.0 / (1.0 - ATTITUDE_AGE * full_rate)
-    return (sent_x + about_x) * believed, (sent_y + about_y) * believed, about_z
+    held_x, held_y = moment[0] * dot(velocity, left) * across, moment[1] * dot(velocity, ahead) * along
+    return (sent_x + about_x) * believed - held_x, (sent_y + about_y) * believed - held_y, about_z
 
 
 @register_jitable(forceinline=True)

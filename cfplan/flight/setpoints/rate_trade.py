@@ -23,6 +23,9 @@ hardly defined. In the axes of q̂, with n the direction of φ × z, and u the v
     z(q')·u = u_n sin φ + u_z cos φ >= cos LEAN_MAX    ⟺    φ <= atan2(u_n, u_z) + acos(cos LEAN_MAX / |(u_n, u_z)|)
 
 which changes steadily along a motion. Where the attitude to fly leans as far itself, only what rights it is traded.
+
+In flight the air turns the body in proportion to its velocity (Airframe.velocity_moment), and the controller must hold
+against it. What is traded is therefore ω + M v, with M v the rate for which kw gives just that torque.
 """
 
 import math
@@ -37,7 +40,7 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.machine_code import njit
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import Space
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.panels import (
     WIDTH,
     give_out,
@@ -50,7 +53,7 @@ from cfplan.vehicle.panels import (
     write_quaternion_in,
     write_triple,
 )
-from cfplan.vehicle.rotations import dot, heading_of, matrix_rows, norms, product, transpose, turn_rows
+from cfplan.vehicle.rotations import dot, heading_of, matrices_of, matrix_rows, norms, product, transpose, turn_rows
 from cfplan.vehicle.trigonometry import cosine, sine
 
 BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
@@ -94,6 +97,8 @@ class AttitudeGains:
 
     kR_xy: float = MellingerGains().kR_xy
     kw_xy: float = MellingerGains().kw_xy
+    moment_rates: tuple[float, float] = (0.0, 0.0)
+    """rad/s per m/s, M: rate about x by velocity along y, and about y by velocity along x, in body axes."""
     level_out: LevelOut = UNTIL_WATCHDOG
 
     @property
@@ -106,8 +111,30 @@ FIRMWARE_GAINS = AttitudeGains()
 
 
 def gains_under(limits: Limits) -> AttitudeGains:
-    """Return the firmware's gains, with level-out as long as safety.yaml lets it last."""
-    return replace(FIRMWARE_GAINS, level_out=UNTIL_WATCHDOG if limits.firmware.watchdog else UNTIL_TIMEOUT)
+    """Return the firmware's gains for an airframe, with level-out as long as safety.yaml lets it last."""
+    level_out = UNTIL_WATCHDOG if limits.firmware.watchdog else UNTIL_TIMEOUT
+    return replace(FIRMWARE_GAINS, moment_rates=moment_rates(limits.airframe), level_out=level_out)
+
+
+def moment_rates(airframe: Airframe) -> tuple[float, float]:
+    """Return the rates, rad/s per m/s, whose torque holds the body against the air; as AttitudeGains has them.
+
+    The controller adds kw/2 to two motors and takes it from the others, in 16-bit units, for each rad/s.
+    """
+    torque = FIRMWARE_GAINS.kw_xy * airframe.arm / (2.0 * airframe.command_per_thrust)  # N m for each rad/s
+    about_x, about_y = airframe.velocity_moment
+    return -about_x / torque, about_y / torque
+
+
+def held_against_air(motion: FullStateSetpoints, gains: AttitudeGains, sign: float = 1.0) -> FullStateSetpoints:
+    """Return a motion with the rates to ask for instead of those to fly; with `sign` -1 the other way round."""
+    if gains.moment_rates == (0.0, 0.0):
+        return motion
+    rate = np.array(motion.body_rate, dtype=float)
+    along = np.einsum("nij,ni->nj", matrices_of(motion.quaternion), motion.velocity)  # in body axes
+    rate[:, 0] += sign * gains.moment_rates[0] * along[:, 1]
+    rate[:, 1] += sign * gains.moment_rates[1] * along[:, 0]
+    return replace(motion, body_rate=rate)
 
 
 GAIN_TOLERANCE = 0.05
@@ -126,6 +153,7 @@ def trade_rates(
     `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later; without a space there are no walls to
     lean away from. The rates come out in whole millirad/s, as packets hold them, and the attitudes make up for those.
     """
+    motion = held_against_air(motion, gains)
     rate, quaternion, acceleration = _traded(
         np.array(motion.position, dtype=float, order="C"),
         np.array(motion.velocity, dtype=float, order="C"),
@@ -151,6 +179,7 @@ def harmless_rates(
 
     The check of the bytes compares with these, so they are computed apart from trade_rates, from a(t) to tilt to rate.
     """
+    motion = held_against_air(motion, gains)
     return _harmless(
         np.array(motion.position, dtype=float, order="C"),
         np.array(motion.velocity, dtype=float, order="C"),

@@ -68,7 +68,7 @@ def committed(flown):
 def continued(flown, committed, number, waypoints, limits):
     """The flight that leaves `flown` at setpoint `number`, and its setpoints from there on, the first as committed."""
     joint = number / RATE + LEAD
-    new = continue_plan(flown.trajectories[-1], joint - flown.starts[-1], waypoints, limits)
+    new = continue_plan(flown.trajectories[-1], joint - flown.starts[-1], waypoints, limits, leave_room=False)
     joined = flown.continued(joint, new.plan.trajectory)
     setpoints = encoded(joined, number)
     payloads = setpoints.payloads.copy()

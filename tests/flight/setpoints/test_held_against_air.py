@@ -1,0 +1,77 @@
+"""In flight the air turns the body in proportion to its velocity; setpoints ask for what holds it, and for no more."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cfplan.flight.setpoints.commitment import Commitment, propose, splice
+from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.setpoints.rate_trade import gains_under, moment_rates
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.plan import plan
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.dry_run import dry_run
+from cfplan.vehicle.airframes import as_flown
+
+WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
+
+
+@pytest.fixture(scope="module")
+def limits():
+    """The limits of the project's own safety.yaml."""
+    return load_limits(Path(__file__).parents[3] / "safety.yaml")
+
+
+@pytest.fixture(scope="module")
+def planned(limits):
+    path = min_snap(WAYPOINTS, times=centripetal_times(WAYPOINTS))
+    return plan(path, limits.airframe, limits, planner="expert").trajectory
+
+
+@pytest.fixture(scope="module")
+def turned(limits):
+    """Limits whose airframe the air turns as public flights show."""
+    moment = as_flown(limits.airframe).velocity_moment
+    assert min(moment) > 0.0
+    return replace(limits, airframe=replace(limits.airframe, velocity_moment=moment))
+
+
+def encoded(planned, limits):
+    return encode_trajectory(planned, gains=gains_under(limits), space=limits.space)
+
+
+def test_the_rates_are_those_of_public_flights(turned):
+    """0.19 rad/s of roll rate and 0.26 of pitch rate per m/s, with the firmware's gains."""
+    about_x, about_y = moment_rates(turned.airframe)
+    assert about_x == pytest.approx(-0.19, abs=0.02)
+    assert about_y == pytest.approx(0.26, abs=0.02)
+
+
+def test_a_vehicle_that_the_air_turns_follows_twice_as_closely(planned, limits, turned):
+    without, held = encoded(planned, limits), encoded(planned, turned)
+    astray, near = (dry_run(each, planned, turned.airframe, limits.flight).deviation for each in (without, held))
+    assert astray > 0.03
+    assert near < astray / 2.0
+
+
+def test_the_bytes_are_certified_and_the_pilot_accepts_them(planned, limits, turned):
+    """As the motion that they make the vehicle fly is the same."""
+    held = encoded(planned, turned)
+    check_bytes(held, planned, turned.plan)
+    stops = encode_stops(held.motion, 100.0, gains=held.gains, space=held.space)
+    first = Commitment(0, held.payloads, stops)
+    again = propose(first, 50, held.payloads[50:], stops[50:])
+    assert isinstance(splice(first, again, 40, turned), Commitment)
+    plain = encoded(planned, limits)
+    assert (plain.payloads != held.payloads).any()
+    for name in ("position", "velocity"):
+        np.testing.assert_array_equal(getattr(plain.decoded, name), getattr(held.decoded, name))
+
+
+def test_at_rest_nothing_is_held(planned, turned, limits):
+    np.testing.assert_array_equal(encoded(planned, turned).payloads[-1], encoded(planned, limits).payloads[-1])
+    assert not decode(encoded(planned, turned).payloads[-1:]).velocity.any()
