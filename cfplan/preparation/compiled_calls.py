@@ -47,7 +47,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         from cfplan.planning.plan import plan
         from cfplan.safety.limits_file import load_limits
         from cfplan.simulation.glitches import glitch_at_sampled_setpoints
-        from cfplan.simulation.link_loss import link_loss_at_every_setpoint, link_loss_within_stops
+        from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_stops
 
         limits = load_limits(safety_file)
         limits = replace(limits, space=replace(limits.space, obstacles=()))  # one may stand in the middle
@@ -62,7 +62,7 @@ def _fly(safety_file: Path, last: Stage) -> "list[Call]":
         planned = plan(path, limits.airframe, limits, planner="expert", nodes=NODES)  # exceeds limits between nodes
         encoded = encode_trajectory(planned.trajectory, gains=gains_under(limits), space=limits.space)
         begin, first = encoded.payloads[:2], np.array([0])
-        lost = link_loss_at_every_setpoint(begin, limits)
+        lost = link_loss_near_walls(begin, limits, 0.0)
         stop = encode_stops(encoded.motion, RATE, rows=first, gains=encoded.gains, space=encoded.space)
         end = np.arange(stop.shape[1])[None] == stop.shape[1] - 1
         for coarsely in (True, False):

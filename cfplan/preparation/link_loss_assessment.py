@@ -23,7 +23,7 @@ from cfplan.safety.space import SIDES
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
     LinkLossMoments,
-    link_loss_at_every_setpoint,
+    link_loss_near_walls,
     link_loss_within_stops,
 )
 
@@ -39,7 +39,7 @@ GRIDS = ((STOPS_EVERY, STOPS_EACH, 0.18), (3, 4, 0.1), (1, 2, 0.0))
 
 def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MARGIN) -> Assessment:
     """Simulate that each setpoint is the last one; what comes down within `margin`, m, of a wall is at fault."""
-    moments, faces = link_loss_at_every_setpoint(encoded.payloads, limits), limits.space.faces
+    moments, faces = link_loss_near_walls(encoded.payloads, limits, margin), limits.space.faces
 
     def describe(at: int) -> str:
         return f"takes the vehicle to {limits.space.describe(moments.beyond[at], moments.face[at])}"

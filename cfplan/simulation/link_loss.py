@@ -120,22 +120,25 @@ def link_loss_at_every_setpoint(
     return _judge(np.arange(len(rows)) / rate, state.position, boxes, limits, snapshots)
 
 
+def link_loss_near_walls(
+    payloads: NDArray, limits: Limits, within: float, rate: float = RATE, starts: NDArray | None = None
+) -> LinkLossMoments:
+    """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst of all.
+
+    What a first look says to end farther than that and ALLOWANCE inside is taken to end ALLOWANCE farther out than it
+    says. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half of its time.
+    """
+    return _look_at_some(payloads, limits, rate, starts, within)
+
+
 def link_loss_at_walls(
     payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
 ) -> LinkLossMoments:
     """Lose the link after each setpoint that may leave the vehicle beyond a wall.
 
-    As link_loss_at_every_setpoint(), in a quarter of its time. What a first look says to end farther than ALLOWANCE
-    inside is taken to end that much farther out than it says; so of a flight that ends inside from everywhere this does
-    not find the worst moment.
+    As link_loss_near_walls() does, but of a flight that ends inside from everywhere it does not find the worst moment.
     """
-    state = decode(payloads)
-    rows, airframes = setpoint_rows(state), _airframes(limits)
-    snapshots = _flown(rows, limits, airframes, rate, _begins(state, limits, starts))
-    seen = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
-    near = _look_again(seen, rows, snapshots, limits, ALLOWANCE)
-    found = _judge(np.arange(len(rows)) / rate, state.position, seen, limits, snapshots)
-    return replace(found, beyond=np.where(near, found.beyond, found.beyond + ALLOWANCE))
+    return _look_at_some(payloads, limits, rate, starts, None)
 
 
 def foreseen_link_loss(
@@ -155,7 +158,7 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
         return found
     rows, boxes = setpoint_rows(state), found.boxes
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, None))
-    _look_again(boxes, rows, snapshots, limits, _SLOW_ALLOWANCE)
+    _look_again(boxes, rows, snapshots, limits, ~(found.beyond < -_SLOW_ALLOWANCE))
     return _judge(found.time, state.position, boxes, limits, snapshots)
 
 
@@ -235,15 +238,30 @@ def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -
     return _united([boxes[np.where(some, after, after - 1)], boxes[after]])
 
 
-def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, allowance: float) -> NDArray:
-    """Replace the boxes, (N, S, 2, 3), that a first look says to end within `allowance`, m, of a wall; return these.
+def _look_at_some(
+    payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, within: float | None
+) -> LinkLossMoments:
+    """Look closely at what may end `within` m of a wall, and at the worst; at what may end outside, where None."""
+    state = decode(payloads)
+    rows, number = setpoint_rows(state), np.arange(len(payloads))
+    snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
+    boxes = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
+    most = limits.space.swept(boxes)[0] + ALLOWANCE
+    near = ~(most < -(within or 0.0))
+    if within is not None:
+        near |= number == most.argmax()
+    _look_again(boxes, rows, snapshots, limits, near)
+    found = _judge(number / rate, state.position, boxes, limits, snapshots)
+    others = ~near & (most > found.beyond[near].max(initial=-np.inf))
+    if within is not None and others.any():  # which may be worse
+        _look_again(boxes, rows, snapshots, limits, others)
+        found, near = _judge(number / rate, state.position, boxes, limits, snapshots), near | others
+    return replace(found, beyond=np.where(near, found.beyond, most))
 
-    `snapshots` are (L, N, 31).
-    """
-    beyond, _ = limits.space.swept(boxes)
-    near: NDArray = ~(beyond + allowance < 0.0)
-    boxes[near] = _swept(_Forks(rows, np.flatnonzero(near), snapshots[:, near], _airframes(limits)), limits)
-    return near
+
+def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
+    """Replace `some`, (N,) bool, of the boxes, (N, S, 2, 3), of a first look; `snapshots` are (L, N, 31)."""
+    boxes[some] = _swept(_Forks(rows, np.flatnonzero(some), snapshots[:, some], _airframes(limits)), limits)
 
 
 class _Forks(NamedTuple):

@@ -74,7 +74,7 @@ def called(monkeypatch):
     """Notes each call of what encodes, checks and simulates."""
     noted = []
     for module, name in (
-        (link_loss_assessment, "link_loss_at_every_setpoint"), (glitch_assessment, "glitch_at_sampled_setpoints"),
+        (link_loss_assessment, "link_loss_near_walls"), (glitch_assessment, "glitch_at_sampled_setpoints"),
         (link_loss, "link_loss_at_every_setpoint"), (preparation, "check_bytes"), (preparation, "dry_run"),
         (preparation, "certify_stops"),
     ):  # fmt: skip
@@ -83,7 +83,7 @@ def called(monkeypatch):
     return noted
 
 
-IN_PLANNING = ["glitch_at_sampled_setpoints", "link_loss_at_every_setpoint"]
+IN_PLANNING = ["glitch_at_sampled_setpoints", "link_loss_near_walls"]
 
 
 def test_nothing_is_simulated_twice(limits, called):

@@ -21,6 +21,7 @@ from cfplan.simulation.link_loss import (
     foreseen_link_loss,
     link_loss_at_every_setpoint,
     link_loss_at_walls,
+    link_loss_near_walls,
     link_loss_of_slow_motion,
     link_loss_within_stops,
     simulate_link_loss,
@@ -221,13 +222,19 @@ def test_it_says_which_wall(limits):
 
 @pytest.mark.parametrize("name", ["line", "loop3d", "slalom"])
 @pytest.mark.parametrize("speed", [2.0, 3.0])
-def test_a_first_look_tells_how_far_each_ends_at_most(name, speed, limits):
+def test_what_may_end_near_a_wall_is_simulated_and_of_the_rest_is_known_how_far_it_ends_at_most(name, speed, limits):
     fast = replace(limits, plan=replace(limits.plan, speed=speed, acceleration=2.5 * speed))
     payloads = prepare_mission(REPOSITORY / "flights" / f"{name}.yaml", fast).payloads
-    exact, found = link_loss_at_every_setpoint(payloads, fast), link_loss_at_walls(payloads, fast)
-    assert np.all(found.beyond >= exact.beyond)
-    assert np.all(found.beyond <= exact.beyond + 2.5 * ALLOWANCE)
-    np.testing.assert_array_equal(found.snapshots, exact.snapshots)
+    for within in (0.0, 0.45):
+        all_of_them, found = link_loss_at_every_setpoint(payloads, fast), link_loss_near_walls(payloads, fast, within)
+        assert found.worst == all_of_them.worst
+        near = all_of_them.beyond > -within
+        assert within == 0.0 or near.any()
+        np.testing.assert_array_equal(found.beyond[near], all_of_them.beyond[near])
+        np.testing.assert_array_equal(found.face[near], all_of_them.face[near])
+        assert np.all(found.beyond >= all_of_them.beyond)
+        assert np.all(found.beyond <= all_of_them.beyond + 2.5 * ALLOWANCE)
+        np.testing.assert_array_equal(found.snapshots, all_of_them.snapshots)
 
 
 @pytest.mark.parametrize("name", ["line", "scan"])

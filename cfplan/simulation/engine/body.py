@@ -63,6 +63,16 @@ def step_body(vehicle: NDArray, step: float) -> None:
     stay_above_floor(vehicle, 1, 0, step)
 
 
+@njit(allocates=False, error_model="numpy")
+def step_and_feel(vehicle: NDArray, step: float, felt: NDArray) -> None:
+    """Advance one vehicle; write the specific force, (3,) m/s² in body axes, that its accelerometer measures then."""
+    vx, vy, vz = vehicle[3], vehicle[4], vehicle[5]
+    step_body(vehicle, step)
+    axes = axes_of(vehicle[6], vehicle[7], vehicle[8], vehicle[9])
+    fx, fy, fz = (vehicle[3] - vx) / step, (vehicle[4] - vy) / step, (vehicle[5] - vz) / step + GRAVITY
+    felt[0], felt[1], felt[2] = _along(axes, fx, fy, fz)
+
+
 @register_jitable(forceinline=True)
 def move(batch: NDArray, width: int, n: int, step: float) -> None:
     """Advance a lane by a step, s; what stands on the floor and is not lifted stays. `stay_above_floor` comes next."""

@@ -17,7 +17,7 @@ from scipy.signal import butter
 from cfplan.flight.firmware import MellingerGains
 from cfplan.machine_code import njit
 from cfplan.simulation.engine import lee, mellinger
-from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.body import TIME_STEP, step_and_feel
 from cfplan.simulation.engine.kalman import Filter, Prior, estimate, new_filter, step_filter
 from cfplan.simulation.engine.layout import (
     ASKED,
@@ -33,7 +33,7 @@ from cfplan.simulation.engine.layout import (
 )
 from cfplan.simulation.engine.lee import LeeGains
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import axes_of, matrix_of, yaw_of
+from cfplan.vehicle.rotations import matrix_of, yaw_of
 
 BELIEF_SIZE = 13
 POSE_LATENCY = 0.005  # s; public logs: 3 to 8 ms
@@ -198,12 +198,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
             _control(loop, loop.setpoints[newest], belief, control)
         loop.control[step] = control
         vehicle[THRUST_SCALE] = loop.scale[step]
-        vx, vy, vz = state[3], state[4], state[5]
-        step_body(vehicle, TIME_STEP)
-        fx, fy, fz = (state[3] - vx) / TIME_STEP, (state[4] - vy) / TIME_STEP, (state[5] - vz) / TIME_STEP + GRAVITY
-        axes = axes_of(state[6], state[7], state[8], state[9])
-        for axis in range(3):
-            forces[axis] = axes[axis][0] * fx + axes[axis][1] * fy + axes[axis][2] * fz
+        step_and_feel(vehicle, TIME_STEP, forces)
 
 
 @register_jitable

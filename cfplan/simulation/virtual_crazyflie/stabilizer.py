@@ -10,7 +10,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.engine.body import TIME_STEP, step_body
+from cfplan.simulation.engine.body import TIME_STEP, step_and_feel
 from cfplan.simulation.engine.kalman import Filter, estimate, reset, step_filter
 from cfplan.simulation.engine.layout import (
     AIRFRAME,
@@ -40,7 +40,6 @@ from cfplan.simulation.engine.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, 
 from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import axes_of
 
 # Where each lies in the array of whole numbers: counts, the setpoint's modes, and what the next run is told.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
@@ -217,11 +216,4 @@ def _drive(loop: Loop, per_command: float) -> None:
         loop.counts[OFF_TICKS] += 1
         if vehicle[2] > vehicle[FLOOR] + IN_AIR:
             loop.counts[OFF_IN_AIR_TICKS] += 1
-    vx, vy, vz = vehicle[3], vehicle[4], vehicle[5]
-    step_body(vehicle, TIME_STEP)
-    fx, fy, fz = vehicle[3] - vx, vehicle[4] - vy, vehicle[5] - vz
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes_of(vehicle[6], vehicle[7], vehicle[8], vehicle[9])
-    fx, fy, fz = fx / TIME_STEP, fy / TIME_STEP, fz / TIME_STEP + GRAVITY
-    loop.acceleration[0] = xx * fx + xy * fy + xz * fz
-    loop.acceleration[1] = yx * fx + yy * fy + yz * fz
-    loop.acceleration[2] = zx * fx + zy * fy + zz * fz
+    step_and_feel(vehicle, TIME_STEP, loop.acceleration)
