@@ -24,8 +24,8 @@ from cfplan.simulation.geometric_flight import LOST, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.networks import Kind
 from studies.paper.printed import ARCHITECTURES
-from studies.paper.trained import NetworkSettings, PaperPath, TrainedNetwork, paper_data
-from studies.paper.training import SequenceOptions
+from studies.paper.trained import SEEDS, NetworkSettings, PaperPath, TrainedNetwork, paper_data
+from studies.paper.training import OURS, SequenceOptions
 from studies.paper.trials import (
     SAMPLE,
     PaperTrial,
@@ -44,6 +44,7 @@ from studies.runner.study import Run, Study, Work
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
 SHIPPED_NODES = 100
 AS_BYTES = "the shipped planner, as bytes"
+SEVERAL = (Kind.LSTM, Kind.BIDIRECTIONAL)  # architectures that are trained with several seeds
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,7 @@ class Settings(NetworkSettings):
     """The networks to compare, and the paths."""
 
     kinds: tuple[Kind, ...] = option(tuple(Kind), "Architecture.")
+    seeds: int = option(3, f"{SEEDS} Other architectures are trained once.", least=1)
 
 
 SHIPPED_COLUMNS = (
@@ -70,13 +72,20 @@ SHIPPED_COLUMNS = (
 
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
-    data = paper_data(settings, run, [SequenceOptions(kind=Kind(kind)) for kind in settings.kinds])
+    wanted = [
+        replace(OURS if kind == Kind.BIDIRECTIONAL else SequenceOptions(kind=Kind(kind)), seed=seed)
+        for kind in settings.kinds
+        for seed in range(settings.seeds if kind in SEVERAL else 1)
+    ]
+    data = paper_data(settings, run, wanted)
     return Work(data.paths, partial(measure, data.networks), PaperTrial, data.identity)
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
     """Plan a path with all planners, and fly the shipped planner's plan in packets too."""
     trials = path_trials(planners(networks), {each.name: each for each in networks}, asked)
+    models = {each.name: each.options.model for each in networks}  # a row of the table is of all seeds
+    trials = [replace(trial, planner=models.get(trial.planner, trial.planner)) for trial in trials]
     return [*trials, _shipped(PaperTrial(AS_BYTES, asked.part, asked.row, repaired=True), amid(asked.path))]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from cfplan.safety.limit_sets import PAPER
 from studies.paper.printed import ROBUSTNESS, paper_column
-from studies.paper.trials import DEVIATION, DEVIATION_FLOWN, FAILED, PAPER_LAG
+from studies.paper.trials import DEVIATION, DEVIATION_FLOWN, FAILED, PAPER_LAG, SPREAD
 from studies.runner.reductions import count, finite, mean, median, quantile
 from studies.runner.result import Column, Table, table
 
@@ -62,6 +62,7 @@ def robustness_table(trials: Sequence[RobustnessTrial], reference: str) -> Table
         Column("epsilon", "ε", "m", "g"),
         Column("trials", value=count()),
         DEVIATION,
+        SPREAD,
         DEVIATION_FLOWN,
         _paper("deviation", unit="m", spec=".3f"),
         replace(FAILED, of="trials"),
