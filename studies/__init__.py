@@ -14,5 +14,5 @@ STUDIES = {
 }  # fmt: skip
 """The module of each study by its name on the command line."""
 
-COMMANDS = dict.fromkeys(("figures", "paper"), "studies.paper.commands")
+COMMANDS = dict.fromkeys(("figures", "networks", "paper"), "studies.paper.commands")
 """The module of each other command by its name there."""

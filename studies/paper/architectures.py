@@ -72,13 +72,17 @@ SHIPPED_COLUMNS = (
 
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
-    wanted = [
+    data = paper_data(settings, run, wanted(settings))
+    return Work(data.paths, partial(measure, data.networks), PaperTrial, data.identity)
+
+
+def wanted(settings: Settings) -> list[SequenceOptions]:
+    """Return the options of the networks to compare."""
+    return [
         replace(OURS if kind == Kind.BIDIRECTIONAL else SequenceOptions(kind=Kind(kind)), seed=seed)
         for kind in settings.kinds
         for seed in range(settings.seeds if kind in SEVERAL else 1)
     ]
-    data = paper_data(settings, run, wanted)
-    return Work(data.paths, partial(measure, data.networks), PaperTrial, data.identity)
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
