@@ -12,6 +12,12 @@ if TYPE_CHECKING:
     from cfplan.learning.checkpoints import Epoch
 
 
+NETWORKS = click.option(
+    "--networks", "folder", type=click.Path(path_type=Path), default=Path("datasets/paper-networks"),
+    show_default=True, help="Folder of the networks.",
+)  # fmt: skip
+
+
 @click.command(epilog="Example: python -m studies paper results --workers 2")
 @click.argument("folder", metavar="[DIR]", type=click.Path(path_type=Path), default=Path("results"))
 @click.option("--quick", is_flag=True, help="Smoke test: a few paths and epochs, on data made for it.")
@@ -22,12 +28,12 @@ def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> Non
 
     Networks, and results of the present sources and settings, are kept, so that a run that was stopped resumes.
     """
+    from studies.paper import trained
     from studies.paper.all_networks import train_all
     from studies.paper.all_tables import paper_results
-    from studies.paper.trained import DATA, NETWORKS
 
     if not quick:
-        for name, training in train_all(DATA, NETWORKS, on_epoch=_say_epoch):
+        for name, training in train_all(trained.DATA, trained.NETWORKS, on_epoch=_say_epoch):
             click.echo(f"{name}: {training.seconds:.0f} s of the processor")
     with progress_bars() as bar:
         effort = Effort(workers, scheduler, say=note, progress=bar)
@@ -42,8 +48,7 @@ def paper(folder: Path, quick: bool, workers: int, scheduler: str | None) -> Non
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--data", type=click.Path(path_type=Path), default=Path("datasets/paper"), show_default=True,
               help="Dataset; its first 100 paths are for testing.")  # fmt: skip
-@click.option("--networks", "folder", type=click.Path(path_type=Path), default=Path("datasets/paper-networks"),
-              show_default=True, help="Folder of the networks.")  # fmt: skip
+@NETWORKS
 def networks(names: tuple[str, ...], data: Path, folder: Path) -> None:
     """Train the networks of the paper's simulated tables, by default all, until their validation loss is flat.
 
@@ -66,9 +71,10 @@ def _say_epoch(name: str, epoch: "Epoch") -> None:
 @click.command(epilog="Example: python -m studies figures results docs/images")
 @click.argument("results", metavar="[RESULTS]", type=click.Path(path_type=Path), default=Path("results"))
 @click.argument("images", metavar="[IMAGES]", type=click.Path(path_type=Path), default=Path("docs/images"))
-def figures(results: Path, images: Path) -> None:
-    """Draw the paper's figures as .png in IMAGES from the rows of the cases in RESULTS."""
+@NETWORKS
+def figures(results: Path, images: Path, folder: Path) -> None:
+    """Draw the paper's figures as .png in IMAGES from the rows of the cases in RESULTS and the networks' logs."""
     from studies.paper.figures import write_figures
 
-    for file, reason in write_figures(results, images):
+    for file, reason in write_figures(results, images, folder):
         click.echo(f"{file}: left out: {reason}" if reason else file)
