@@ -95,7 +95,6 @@ class SequenceOptions:
     rate: float = 3e-3  # the highest learning rate; a third of it for Transformers
     width: int | None = None  # of the network's layers; None: as in `SIZES`
     slopes: float = 0.0  # weight of the squared error of differences between nodes; 0 in the paper's networks
-    caution: float = 1.0  # weight of the squared errors of h that is too large; 1 in the paper's networks
     seed: int = 0
 
     @property
@@ -114,7 +113,6 @@ class SequenceOptions:
         noise = f"-{self.epsilon:g}" if self.epsilon else ""
         noise += "-solved" if self.relabel is Relabel.SOLVE else ""
         noise += f"-slopes-{self.slopes:g}" if self.slopes else ""
-        noise += f"-caution-{self.caution:g}" if self.caution != 1.0 else ""
         noise += f"-wide-{self.width}" if self.width else ""
         inputs = "" if self.inputs is Inputs.ALL else f"-{self.inputs.replace('/', '-')}"
         return f"{self.kind}{noise}{inputs}"
@@ -284,9 +282,8 @@ def _judge(network: SequenceNetwork, unseen: Sequences, options: SequenceOptions
 def loss(network: SequenceNetwork, found: Tensor, wanted: Tensor, options: SequenceOptions) -> Tensor:
     """Return the loss of answers, (B, N, 2)."""
     errors = network.scaled(found) - network.scaled(wanted)
-    squares, slopes = errors.square(), errors.diff(dim=1).square().mean((0, 1))
-    h = torch.where(errors[..., 0] > 0.0, options.caution * squares[..., 0], squares[..., 0]).mean()
-    return h + options.slopes * slopes[0] + YAW * (squares[..., 1].mean() + options.slopes * slopes[1])
+    h, yaw = errors.square().mean((0, 1)) + options.slopes * errors.diff(dim=1).square().mean((0, 1))
+    return h + YAW * yaw
 
 
 def _rate(options: SequenceOptions, log: Sequence[Epoch]) -> float:
