@@ -30,12 +30,13 @@ from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.printed import TEST
 from studies.paper.recovery import recover_profile
 from studies.paper.robustness_tables import (
+    FACTORS,
     HELD_YAW,
     SCALES,
     SHIPPED,
     SHIPPED_FIXED,
     SHIPPED_TANGENT,
-    TOLERANCES,
+    TOLERANCE,
     RobustnessTrial,
     robustness_table,
     variation_table,
@@ -170,7 +171,8 @@ def _flown(begun: RobustnessTrial, path: Path, found: Answered | str, clean: Ans
     trajectory = Trajectory(path, found.profile, PAPER.airframe)
     flight = fly_geometric(trajectory, FLOWN)
     places, speeds = nearest_states(flight.flight, trajectory, trajectory.time_at(found.profile.s))
-    reached = tuple(float(np.mean((places <= place) & (speeds <= speed))) for place, speed in TOLERANCES)
+    needed = np.maximum(places / TOLERANCE[0], speeds / TOLERANCE[1])
+    reached = tuple(float(np.mean(needed <= factor)) for factor in FACTORS)
     trial = replace(begun, travel_time=trajectory.duration, deviation=flight.deviation, reached=reached)
     if isinstance(clean, str):
         return trial
