@@ -9,7 +9,7 @@ STUDIES = {
         "dry_runs", "exports", "faults", "flights", "giving_way", "horizon", "identification", "lateness", "latency",
         "link_loss", "physics", "planners", "random_faults", "steering", "stops", "waypoints",
         "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
-        "paper.simulators", "paper.yaw_consistency",
+        "paper.search", "paper.simulators", "paper.yaw_consistency",
     )
 }  # fmt: skip
 """The module of each study by its name on the command line."""

@@ -7,6 +7,7 @@ in packets, and flown in the dry run. Interrupted training resumes from its last
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 
@@ -44,6 +45,7 @@ from studies.runner.study import Run, Study, Work
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
 SHIPPED_NODES = 100
 AS_BYTES = "the shipped planner, as bytes"
+OF_KIND = MappingProxyType({kind: SequenceOptions(kind=kind) for kind in Kind} | {OURS.kind: OURS})
 SEVERAL = (Kind.LSTM, Kind.BIDIRECTIONAL)  # architectures that are trained with several seeds
 
 
@@ -79,7 +81,7 @@ def work(settings: Settings, run: Run) -> Work:
 def wanted(settings: Settings) -> list[SequenceOptions]:
     """Return the options of the networks to compare."""
     return [
-        replace(OURS if kind == Kind.BIDIRECTIONAL else SequenceOptions(kind=Kind(kind)), seed=seed)
+        replace(OF_KIND[Kind(kind)], seed=seed)
         for kind in settings.kinds
         for seed in range(settings.seeds if kind in SEVERAL else 1)
     ]

@@ -30,7 +30,6 @@ from studies.paper.recovery import nodal_time
 from studies.paper.sequences import Inputs, Sequences, select_inputs
 
 WEIGHTS, BEST = "weights.safetensors", "best.safetensors"  # of a finished training; of its best epoch until then
-FORCED = (Kind.TRANSFORMER, Kind.MLP, Kind.NEIGHBOURS)  # trained by teacher forcing
 WARM_UP = 200  # steps over which the learning rate rises at first
 CLIP = 1.0  # largest norm of the gradient
 YAW = 0.01  # weight of the squared error of cos ψ relative to that of log h, both normalised
@@ -44,8 +43,8 @@ class UntilFlat:
     """When a training ends: once its validation loss is flat at every learning rate.
 
     The loss is flat after `patience` epochs in which it stayed above (1 - `improvement`) of the least until then. The
-    learning rate is then multiplied by `factor`; after `cuts` such cuts the training ends. Its network is that of the
-    epoch with the least validation loss.
+    learning rate is then multiplied by `factor`, `cuts` times; when the loss is flat once more, the training ends. Its
+    network is that of the epoch with the least validation loss.
     """
 
     patience: int = 5  # epochs
@@ -110,12 +109,15 @@ class SequenceOptions:
     @property
     def model(self) -> str:
         """Return the name of its tables' rows, which trainings with different seeds share."""
-        noise = f"-{self.epsilon:g}" if self.epsilon else ""
-        noise += "-solved" if self.relabel is Relabel.SOLVE else ""
-        noise += f"-slopes-{self.slopes:g}" if self.slopes else ""
-        noise += f"-wide-{self.width}" if self.width else ""
-        inputs = "" if self.inputs is Inputs.ALL else f"-{self.inputs.replace('/', '-')}"
-        return f"{self.kind}{noise}{inputs}"
+        parts = (
+            str(self.kind),
+            f"{self.epsilon:g}" if self.epsilon else "",
+            "solved" if self.relabel is Relabel.SOLVE else "",
+            f"slopes-{self.slopes:g}" if self.slopes else "",
+            f"width-{self.width}" if self.width else "",
+            "" if self.inputs is Inputs.ALL else self.inputs.replace("/", "-"),
+        )
+        return "-".join(part for part in parts if part)
 
 
 OURS = SequenceOptions(kind=Kind.BIDIRECTIONAL, slopes=10.0)
