@@ -45,6 +45,7 @@ from studies.runner.study import Run, Study, Work
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
 SHIPPED_NODES = 100
 AS_BYTES = "the shipped planner, as bytes"
+ABLATED = (replace(OURS, slopes=0.0), replace(SequenceOptions(), slopes=OURS.slopes))  # one part of OURS at a time
 OF_KIND = MappingProxyType({kind: SequenceOptions(kind=kind) for kind in Kind} | {OURS.kind: OURS})
 SEVERAL = (Kind.LSTM, Kind.BIDIRECTIONAL)  # architectures that are trained with several seeds
 
@@ -80,11 +81,12 @@ def work(settings: Settings, run: Run) -> Work:
 
 def wanted(settings: Settings) -> list[SequenceOptions]:
     """Return the options of the networks to compare."""
-    return [
+    compared = [
         replace(OF_KIND[Kind(kind)], seed=seed)
         for kind in settings.kinds
         for seed in range(settings.seeds if kind in SEVERAL else 1)
     ]
+    return [*compared, *(each for each in ABLATED if OURS.kind in settings.kinds and each.kind in settings.kinds)]
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:

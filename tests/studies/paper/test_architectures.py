@@ -53,7 +53,7 @@ def test_what_the_paper_prints_is_consistent_where_it_prints_twice():
         (
             architectures,
             architectures.Settings(paths=1, quick=True, seeds=2),
-            [TOPPQUAD, "expert", *list(Kind)[:-1], OURS.model, SHIPPED],
+            [TOPPQUAD, "expert", *list(Kind)[:-1], OURS.model, "BiLSTM", "LSTM-slopes-10", SHIPPED],
         ),
         (inputs, NetworkSettings(paths=1, quick=True), [TOPPQUAD, *Inputs]),
     ],

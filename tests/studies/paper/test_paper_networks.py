@@ -19,7 +19,7 @@ from cfplan.vehicle.timing import duration_of
 from studies.paper.networks import Kind, Size, build_network
 from studies.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
 from studies.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
-from studies.paper.training import SequenceOptions, UntilFlat, answer, load_network, loss, train_network
+from studies.paper.training import SequenceOptions, UntilFlat, answer, load_network, losses, train_network
 
 SMALL = Size(8, 1)
 FED = [Kind.LSTM, Kind.TRANSFORMER, Kind.MLP, Kind.NEIGHBOURS]
@@ -154,10 +154,10 @@ def test_a_loss_that_counts_slopes_is_larger_where_answers_are_rough(sequences):
     known.set_units(torch.from_numpy(sequences.inputs), wanted)
     steady, rough = (wanted * torch.tensor([1.1, 1.0]) ** sign for sign in (torch.ones(100, 1), SIGNS))
     plain, slopes = OPTIONS, replace(OPTIONS, slopes=2.0)
-    usual = loss(known, steady, wanted, plain).item()
-    assert loss(known, rough, wanted, plain).item() == pytest.approx(usual, rel=1e-3)
-    assert loss(known, steady, wanted, slopes).item() == pytest.approx(usual, rel=1e-3)
-    assert loss(known, rough, wanted, slopes).item() == pytest.approx((1.0 + 2.0 * 4.0) * usual, rel=1e-3)
+    usual = losses(known, steady, wanted, plain)[0].item()
+    assert losses(known, rough, wanted, plain)[0].item() == pytest.approx(usual, rel=1e-3)
+    assert losses(known, steady, wanted, slopes)[0].item() == pytest.approx(usual, rel=1e-3)
+    assert losses(known, rough, wanted, slopes)[0].item() == pytest.approx((1.0 + 2.0 * 4.0) * usual, rel=1e-3)
 
 
 def test_noise_moves_what_is_seen_by_at_most_epsilon(sequences):
