@@ -9,10 +9,10 @@ STUDIES = {
         "dry_runs", "exports", "faults", "flights", "giving_way", "horizon", "identification", "lateness", "latency",
         "link_loss", "physics", "planners", "random_faults", "real_flights", "steering", "stops", "waypoints",
         "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
-        "paper.simulators", "paper.yaw_consistency",
+        "paper.search", "paper.simulators", "paper.yaw_consistency",
     )
 }  # fmt: skip
 """The module of each study by its name on the command line."""
 
-COMMANDS = dict.fromkeys(("figures", "paper"), "studies.paper.commands")
+COMMANDS = dict.fromkeys(("figures", "networks", "paper"), "studies.paper.commands")
 """The module of each other command by its name there."""

@@ -7,6 +7,7 @@ in packets, and flown in the dry run. Interrupted training resumes from its last
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,8 +25,8 @@ from cfplan.simulation.geometric_flight import LOST, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.networks import Kind
 from studies.paper.printed import ARCHITECTURES
-from studies.paper.trained import NetworkSettings, PaperPath, TrainedNetwork, paper_data
-from studies.paper.training import SequenceOptions
+from studies.paper.trained import SEEDS, NetworkSettings, PaperPath, TrainedNetwork, paper_data
+from studies.paper.training import OURS, SequenceOptions
 from studies.paper.trials import (
     SAMPLE,
     PaperTrial,
@@ -44,6 +45,9 @@ from studies.runner.study import Run, Study, Work
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
 SHIPPED_NODES = 100
 AS_BYTES = "the shipped planner, as bytes"
+ABLATED = (replace(OURS, slopes=0.0), replace(SequenceOptions(), slopes=OURS.slopes))  # one part of OURS at a time
+OF_KIND = MappingProxyType({kind: SequenceOptions(kind=kind) for kind in Kind} | {OURS.kind: OURS})
+SEVERAL = (Kind.LSTM, Kind.BIDIRECTIONAL)  # architectures that are trained with several seeds
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,7 @@ class Settings(NetworkSettings):
     """The networks to compare, and the paths."""
 
     kinds: tuple[Kind, ...] = option(tuple(Kind), "Architecture.")
+    seeds: int = option(3, f"{SEEDS} Other architectures are trained once.", least=1)
 
 
 SHIPPED_COLUMNS = (
@@ -70,13 +75,25 @@ SHIPPED_COLUMNS = (
 
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
-    data = paper_data(settings, run, [SequenceOptions(kind=Kind(kind)) for kind in settings.kinds])
+    data = paper_data(settings, run, wanted(settings))
     return Work(data.paths, partial(measure, data.networks), PaperTrial, data.identity)
+
+
+def wanted(settings: Settings) -> list[SequenceOptions]:
+    """Return the options of the networks to compare."""
+    compared = [
+        replace(OF_KIND[Kind(kind)], seed=seed)
+        for kind in settings.kinds
+        for seed in range(settings.seeds if kind in SEVERAL else 1)
+    ]
+    return [*compared, *(each for each in ABLATED if OURS.kind in settings.kinds and each.kind in settings.kinds)]
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
     """Plan a path with all planners, and fly the shipped planner's plan in packets too."""
     trials = path_trials(planners(networks), {each.name: each for each in networks}, asked)
+    models = {each.name: each.options.model for each in networks}  # a row of the table is of all seeds
+    trials = [replace(trial, planner=models.get(trial.planner, trial.planner)) for trial in trials]
     return [*trials, _shipped(PaperTrial(AS_BYTES, asked.part, asked.row, repaired=True), amid(asked.path))]
 
 

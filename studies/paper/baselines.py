@@ -132,7 +132,7 @@ def work(settings: Settings, run: Run) -> Work:
     own = [corridor_about(random_course(seed).path) for seed in corridors]
     allocation = train_times(own, [labels[seed] for seed in corridors])
     training += time.process_time() - begun
-    retraining = {each.name: each.training_seconds for each in data.networks} | {ALLOCATION: training}
+    retraining = {each.name: each.trained.seconds for each in data.networks} | {ALLOCATION: training}
     asked, budget = partial(planners, data.networks, allocation), QUICK_BUDGET if settings.quick else Budget()
     seeds = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.paths)}
     drawn = range(settings.seed, settings.seed + DRAWN_PATHS)
@@ -273,4 +273,4 @@ def tables(settings: Settings, rows: list[BaselineTrial]) -> Iterator[Table]:
     yield table("baselines", title, COLUMNS, rows, by=("planner",))
 
 
-STUDY = Study(Settings, work, tables, "--epochs 5 -o results/baselines.json")
+STUDY = Study(Settings, work, tables, "-o results/baselines.json")

@@ -1,5 +1,9 @@
-"""Draw the paper's figures from the rows of results: baselines' paths with AllocNet's boxes, yaw, flown tracks."""
+"""Draw the paper's figures from the rows of results: baselines' paths with AllocNet's boxes, yaw, flown tracks.
 
+The networks' training is drawn from the logs of their folders.
+"""
+
+import csv
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,11 +15,13 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path as PathOfMotion
+from cfplan.learning.checkpoints import LOG
 from cfplan.planning.figure import save_figure
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from studies.paper.baselines import ALLOCATION, BAYESIAN, DRAWN, SHIPPED, BaselineTrial, random_course
 from studies.paper.corridors import box_corners, corridor_about
 from studies.paper.hardware import CERTIFIED, LONG, RAW, TRACKED, HardwareFlight, hardware_paths, long_path
+from studies.paper.training import WEIGHTS
 from studies.paper.trials import TOPPQUAD, failed
 from studies.paper.yaw_consistency import WAYS, Pair
 from studies.runner.result import ITEMS
@@ -48,27 +54,33 @@ class Written(NamedTuple):
     left_out: str  # why it was left out; empty if it was written
 
 
-def write_figures(results: Path, images: Path) -> list[Written]:
-    """Draw each of FIGURES from the rows in `results`, and write it to `images`.
+def write_figures(results: Path, images: Path, networks: Path) -> list[Written]:
+    """Draw each of FIGURES from the rows in `results`, and the training of `networks`, and write them to `images`.
 
-    Figures without rows are left out; rows are not kept in the repository.
+    Figures without rows or networks are left out; neither are kept in the repository.
 
     Raises:
         InputError: no such folder, or a figure that cannot be written.
     """
     if not images.is_dir():
         raise InputError("no such folder", where=str(images), hint="make it first")
+    draw: dict[str, Callable[[], Figure]] = {name: partial(_draw, each, results) for name, each in FIGURES.items()}
+    draw["paper-training"] = lambda: draw_training(read_logs(networks))
     written = []
-    for name, drawing in FIGURES.items():
+    for name, drawn in draw.items():
         file = images / f"{name}.png"
         try:
-            figure = drawing.draw(_read_rows(results, drawing.study, drawing.row))
+            figure = drawn()
         except InputError as error:
             written.append(Written(file, str(error)))
             continue
         save_figure(figure, file, overwrite=True)
         written.append(Written(file, ""))
     return written
+
+
+def _draw(drawing: Drawing, results: Path) -> "Figure":
+    return drawing.draw(_read_rows(results, drawing.study, drawing.row))
 
 
 def _read_rows(results: Path, study: str, row: type) -> list[Any]:
@@ -83,6 +95,44 @@ def _read_rows(results: Path, study: str, row: type) -> list[Any]:
         raise InputError(error.strerror or "no rows of its cases", where=str(file), hint=hint) from None
     except (pa.ArrowInvalid, TypeError):
         raise InputError("not the rows of this study as it is", where=str(file), hint=hint) from None
+
+
+def read_logs(networks: Path) -> dict[str, list[tuple[float, float]]]:
+    """Return the validation loss and the learning rate of each epoch, by name of the trained networks of a folder.
+
+    Raises InputError, with the command that trains them, if there are none.
+    """
+    logs = {}
+    for folder in sorted(file.parent for file in networks.glob(f"*/{WEIGHTS}")):
+        with (folder / LOG).open(newline="") as opened:
+            logs[folder.name] = [(float(row["unseen_loss"]), float(row["rate"])) for row in csv.DictReader(opened)]
+    if not logs:
+        raise InputError("no trained networks", where=str(networks), hint="train them: python -m studies networks")
+    return logs
+
+
+def draw_training(logs: Mapping[str, Sequence[tuple[float, float]]]) -> "Figure":
+    """Draw the validation loss of each network by epoch; dots mark the epochs at which the learning rate was cut."""
+    from matplotlib.figure import Figure
+
+    models: dict[str, list[str]] = {}  # names of the trainings, with different seeds, of each model
+    for name in logs:
+        models.setdefault(name.partition("-seed-")[0], []).append(name)
+    lines = -(-len(models) // PANELS)
+    figure = Figure(figsize=(2.6 * PANELS, 2.2 * lines), layout="constrained")
+    grid = np.atleast_1d(figure.subplots(lines, PANELS, sharey=True)).ravel()
+    for axes, (model, names) in zip(grid, models.items(), strict=False):
+        for name in names:
+            losses, rates = np.array(logs[name]).T
+            (line,) = axes.semilogy(1 + np.arange(len(losses)), losses, lw=0.9)
+            cuts = np.flatnonzero(np.diff(rates) < 0.0)
+            axes.plot(1 + cuts, losses[cuts], ".", color=line.get_color())
+        axes.set_title(model, fontsize=8)
+        axes.tick_params(labelsize=6)
+        axes.grid(alpha=0.25)
+    for axes in grid[len(models) :]:
+        axes.set_visible(False)
+    return figure
 
 
 def draw_baselines(rows: Sequence[BaselineTrial]) -> "Figure":

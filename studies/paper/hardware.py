@@ -326,4 +326,4 @@ def tables(settings: Settings, rows: list[HardwareFlight]) -> Iterator[Table]:
     )  # fmt: skip
 
 
-STUDY = Study(Settings, work, tables, "--epochs 5 -o results/hardware.json")
+STUDY = Study(Settings, work, tables, "-o results/hardware.json")

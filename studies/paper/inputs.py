@@ -19,10 +19,12 @@ from studies.paper.trials import (
 from studies.runner.result import Table
 from studies.runner.study import Run, Study, Work
 
+WANTED = tuple(SequenceOptions(inputs=inputs) for inputs in Inputs)
+
 
 def work(settings: NetworkSettings, run: Run) -> Work:
     """Return one case per path; networks are trained if necessary. Raises what `paper_data` raises."""
-    data = paper_data(settings, run, [SequenceOptions(inputs=inputs) for inputs in Inputs])
+    data = paper_data(settings, run, WANTED)
     networks = {each.options.inputs.value: each for each in data.networks}
     return Work(data.paths, partial(measure, networks), PaperTrial, data.identity)
 

@@ -1,9 +1,10 @@
 """The networks of the paper's Table 1 in torch: LSTM and Transformer encoder-decoders, an encoder, a per-step MLP.
 
+Two are not in the paper: an MLP that sees the nodes on either side, and a bidirectional LSTM.
+
 Each maps the derivatives of a path at N nodes, (B, N, I), to h and cos ψ there, (B, N, 2); means and scales are stored
 with the weights. The networks work with log h: h is more than ten times larger near ends at rest than elsewhere, and
-these ends would dominate the loss. The logarithm, the sizes, and the MLP's inputs are not in the paper: see `SIZES` and
-`REACH`.
+these ends would dominate the loss. The logarithm and the sizes are not in the paper: see `SIZES`.
 
 If `answers` are given, a node's previous answer is the true one (teacher forcing), else the network's.
 """
@@ -12,6 +13,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import StrEnum
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -20,16 +22,17 @@ import torch
 from torch import Tensor, nn
 
 OUTPUTS = 2  # h and cos ψ
-REACH = 8  # nodes on either side that the MLP sees, and number of previous answers that it is fed
 
 
 class Kind(StrEnum):
-    """The architectures of Table 1."""
+    """The architectures of Table 1, and two others."""
 
     LSTM = "LSTM"
     TRANSFORMER = "Transformer"
     ENCODER = "ETransformer"
     MLP = "MLP"
+    NEIGHBOURS = "MLP-neighbours"
+    BIDIRECTIONAL = "BiLSTM"
 
 
 class Size(NamedTuple):
@@ -41,6 +44,7 @@ class Size(NamedTuple):
 
 SIZES = MappingProxyType({
     Kind.LSTM: Size(96, 1), Kind.TRANSFORMER: Size(64, 2), Kind.ENCODER: Size(64, 3), Kind.MLP: Size(192, 3),
+    Kind.NEIGHBOURS: Size(192, 3), Kind.BIDIRECTIONAL: Size(64, 2),
 })  # fmt: skip
 HEADS = 4
 MOST_LOG = 10.0  # bound of |log h|: larger values are failures of the network
@@ -157,33 +161,52 @@ class EncoderTransformer(SequenceNetwork):
         return answers
 
 
-class StepMlp(SequenceNetwork):
-    """Answers node by node, from the path within REACH nodes and the last REACH answers."""
+class BidirectionalLstm(SequenceNetwork):
+    """Reads the path in both directions, with a head at each node: nothing is fed back."""
 
     def __init__(self, inputs: int, size: Size) -> None:
         super().__init__(inputs)
-        widths = [(2 * REACH + 1) * (inputs + 1) + REACH * OUTPUTS] + [size.width] * size.layers
+        self.layers = nn.LSTM(inputs, size.width, size.layers, batch_first=True, bidirectional=True)
+        self.head = nn.Linear(2 * size.width, OUTPUTS)
+
+    def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
+        """See SequenceNetwork."""
+        answers: Tensor = self.head(self.layers(seen)[0])
+        return answers
+
+
+class StepMlp(SequenceNetwork):
+    """Answers node by node, as in the paper from the path there and the previous answer.
+
+    With more reach, from the path within `reach` nodes and that many previous answers.
+    """
+
+    def __init__(self, inputs: int, size: Size, reach: int = 0) -> None:
+        super().__init__(inputs)
+        self.reach, self.fed = reach, max(reach, 1)
+        widths = [(2 * reach + 1) * (inputs + 1) + self.fed * OUTPUTS] + [size.width] * size.layers
         layers = [part for i, o in pairwise(widths) for part in (nn.Linear(i, o), nn.ReLU())]
         self.layers = nn.Sequential(*layers, nn.Linear(size.width, OUTPUTS))
 
     def answer(self, seen: Tensor, fed: Tensor | None) -> Tensor:
         """See SequenceNetwork."""
         there = torch.cat([seen, torch.ones_like(seen[..., :1])], 2)  # marks nodes on the path; padding is 0
-        around = nn.functional.pad(there, (0, 0, REACH, REACH)).unfold(1, 2 * REACH + 1, 1).flatten(2)
-        before = seen.new_zeros(len(seen), REACH, OUTPUTS)
+        window = 2 * self.reach + 1
+        around = nn.functional.pad(there, (0, 0, self.reach, self.reach)).unfold(1, window, 1).flatten(2)
+        before = seen.new_zeros(len(seen), self.fed, OUTPUTS)
         if fed is not None:
-            last = torch.cat([before, fed[:, :-1]], 1).unfold(1, REACH, 1).flatten(2)
+            last = torch.cat([before, fed[:, :-1]], 1).unfold(1, self.fed, 1).flatten(2)
             answers: Tensor = self.layers(torch.cat([around, last], 2))
             return answers
         for n in range(seen.shape[1]):
-            known = torch.cat([around[:, n], before[:, -REACH:].transpose(1, 2).flatten(1)], 1)
+            known = torch.cat([around[:, n], before[:, -self.fed :].transpose(1, 2).flatten(1)], 1)
             before = torch.cat([before, self.layers(known)[:, None]], 1)
-        return before[:, REACH:]
+        return before[:, self.fed :]
 
 
 _NETWORKS: dict[Kind, Callable[[int, Size], SequenceNetwork]] = {
     Kind.LSTM: LstmEncoderDecoder, Kind.TRANSFORMER: TransformerEncoderDecoder, Kind.ENCODER: EncoderTransformer,
-    Kind.MLP: StepMlp,
+    Kind.MLP: StepMlp, Kind.NEIGHBOURS: partial(StepMlp, reach=8), Kind.BIDIRECTIONAL: BidirectionalLstm,
 }  # fmt: skip
 
 

@@ -9,12 +9,15 @@ import numpy as np
 
 from cfplan.safety.limit_sets import PAPER
 from studies.paper.printed import ROBUSTNESS, paper_column
-from studies.paper.trials import DEVIATION, DEVIATION_FLOWN, FAILED, PAPER_LAG
+from studies.paper.trials import DEVIATION, DEVIATION_FLOWN, FAILED, PAPER_LAG, SPREAD
 from studies.runner.reductions import count, finite, mean, median, quantile
 from studies.runner.result import Column, Table, table
 
 SCALES = (0.0, 0.001, 0.01, 0.1)  # m
-TOLERANCES = ((0.02, 0.1), (0.05, 0.25), (0.1, 0.5))  # m and m/s, within which a planned state counts as reached
+TOLERANCE = (0.02, 0.1)  # m and m/s, times a factor: within it a planned state counts as reached
+FACTORS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0)
+SHOWN_FACTORS = (1.0, 2.5, 5.0)
+CLEAN = ("LSTM", 0.001)  # model and ε, m, whose printed in-BRT probability tells the paper's tolerance
 SHIPPED = "the shipped planner, certified"  # yaw is free, as in the paper
 SHIPPED_FIXED, SHIPPED_TANGENT = HELD_YAW = ("the shipped planner, yaw fixed", "the shipped planner, yaw tangent")
 
@@ -37,14 +40,28 @@ class RobustnessTrial:
     h_relative: float = np.nan  # the same, relative
     speed_variation: float = np.nan  # m/s, likewise of the speed at a node
     cosine_variation: float = np.nan  # largest difference of cos ψ
-    reached: Sequence[float] = (0.0,) * len(TOLERANCES)
-    """Fraction of planned states that are reached from the previous one in the planned time, by tolerance."""
+    reached: Sequence[float] = (0.0,) * len(FACTORS)
+    """Fraction of planned states that are reached from the previous one in the planned time, by FACTORS."""
     training: Mapping[str, Any] | None = None  # of the network that planned
 
 
-def _reached(number: int, title: str, meaning: str = "") -> Column:
-    value = mean(lambda trial: trial.reached[number])
-    return Column(f"reached_{number + 1}", title, "%", ".1f", meaning=meaning, value=value)
+def _reached(key: str, title: str, factor: float, meaning: str = "") -> Column:
+    value = mean(lambda trial: np.interp(factor, FACTORS, trial.reached) if np.isfinite(factor) else np.nan)
+    return Column(f"reached_{key}", title, "%", ".1f", meaning=meaning, value=value)
+
+
+def papers_factor(trials: Sequence[RobustnessTrial]) -> float:
+    """Return the factor of TOLERANCE at which CLEAN reaches the fraction that the paper prints; NaN without its trials.
+
+    It is interpolated, and at most the largest of FACTORS.
+    """
+    reached = [trial.reached for trial in trials if (trial.model, trial.epsilon) == CLEAN]
+    return float(np.interp(ROBUSTNESS[CLEAN].in_brt, np.mean(reached, axis=0), FACTORS)) if reached else np.nan
+
+
+def _size(factor: float) -> str:
+    """Return a tolerance in words."""
+    return f"{100 * factor * TOLERANCE[0]:.3g} cm, {100 * factor * TOLERANCE[1]:.3g} cm/s"
 
 
 def _over(time: str) -> Any:
@@ -56,22 +73,27 @@ _paper = partial(paper_column, ROBUSTNESS, by=("model", "epsilon"))
 
 def robustness_table(trials: Sequence[RobustnessTrial], reference: str) -> Table:
     """Return the paper's Table 2 beside the paper's numbers."""
-    first, second, third = (f"{100 * place:g} cm, {100 * speed:g} cm/s" for place, speed in TOLERANCES)
+    first, second, third = SHOWN_FACTORS
+    papers = papers_factor(trials)
     columns = (
         Column("model", "model"),
         Column("epsilon", "ε", "m", "g"),
         Column("trials", value=count()),
         DEVIATION,
+        SPREAD,
         DEVIATION_FLOWN,
         _paper("deviation", unit="m", spec=".3f"),
         replace(FAILED, of="trials"),
         Column("slower", f"time over {reference}, same path", "%", "+.2f", value=_over("own_time")),
         Column("slower_clean", "clean path", "%", "+.2f", value=_over("clean_time")),
         _paper("slower", unit="%", spec="+.2f", meaning="it does not say on which of the two"),
-        _reached(0, f"in BRT: {first}"),
-        _reached(1, second, "fraction of planned states whose position is passed within that in the time before, at a "
-                 "velocity within that, by the controller from where it is"),
-        _reached(2, third),
+        _reached("1", f"in BRT: {_size(first)}", first),
+        _reached("2", _size(second), second, "fraction of planned states whose position is passed within that in the "
+                 "time before, at a velocity within that, by the controller from where it is"),
+        _reached("3", _size(third), third),
+        _reached("papers", "at the paper's tolerance", papers,
+                 f"{_size(papers)}: where the LSTM reaches the paper's {100 * ROBUSTNESS[CLEAN].in_brt:g} % at "
+                 f"ε = {CLEAN[1]:g} m"),
         _paper("in_brt", unit="%", spec=".1f", meaning="within a tolerance that it does not name"),
     )  # fmt: skip
     title = f"Perturbed paths, {PAPER.limits.speed:g} m/s, motor lag {PAPER_LAG:g} s"

@@ -12,14 +12,13 @@ from typing import Any, NamedTuple
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path as PathOfMotion
 from cfplan.geometry.yaw import YawMode
-from cfplan.learning.checkpoints import Epoch
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import DatasetSpec
 from cfplan.safety.limit_sets import BOXES, PAPER
 from studies.paper.networks import SequenceNetwork
 from studies.paper.printed import TEST, TRAIN
 from studies.paper.sequences import Sequences, read_sequences
-from studies.paper.training import SequenceOptions, load_network, train_network
+from studies.paper.training import SequenceOptions, Training, UntilFlat, load_network, train_network
 from studies.runner.options import option
 from studies.runner.result import Column
 from studies.runner.study import Run
@@ -32,9 +31,10 @@ DATA_COMMAND = (
     "cfplan dataset make datasets/paper --count 10100 --seed 1 --limits paper --box 10x10x10 --waypoints 4-4 "
     "--nodes 99 --yaw free"
 )
-QUICK_PATHS, QUICK_TESTED, QUICK_MOST, QUICK_EPOCHS = 40, 20, 4, 2
+QUICK_PATHS, QUICK_TESTED, QUICK_MOST, QUICK_EPOCHS = 40, 20, 4, 2  # epochs at most
 QUICK = "Smoke test: a few paths and epochs, on data made for it."
-EPOCHS = f"Epochs of each training.  [default: {SequenceOptions().epochs}]"
+EPOCHS = f"Epochs after which a training ends though its loss is not flat yet.  [default: {UntilFlat().most}]"
+SEEDS = "Trainings of each LSTM, with different seeds."
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,29 +56,48 @@ class TrainedNetwork:
     options: SequenceOptions
     network: SequenceNetwork
     learned_from: int  # paths
-    training_seconds: float  # s of processor time
+    labels: str  # planner whose answers it learned
+    trained: Training
 
     @property
     def training(self) -> dict[str, Any]:
         """Return the figures of the training tables, which each row of the network carries."""
         return {
-            "network": self.name,
+            "network": self.options.model,
+            "seed": self.options.seed,
             "parameters": sum(tensor.numel() for tensor in self.network.parameters()),
+            "rate": self.options.highest_rate,
             "learned_from": self.learned_from,
-            "epochs": self.options.epochs,
-            "seconds": self.training_seconds,
+            "labels": self.labels,
+            **asdict(self.trained),
         }
 
 
 def _of_training(key: str, title: str, unit: str = "", spec: str = "", meaning: str = "") -> Column:
-    return Column(key, title, unit, spec, meaning=meaning, value=lambda rows: rows[0].training[key])
+    return Column(key, title, unit, spec, meaning=meaning, value=lambda rows: _mean_of(rows, key))
+
+
+def _mean_of(rows: Sequence[Any], key: str) -> Any:
+    """Return the figure of the rows' training, or its mean over trainings with different seeds."""
+    by_seed = {row.training["seed"]: row.training[key] for row in rows}
+    values = list(by_seed.values())
+    return values[0] if isinstance(values[0], str) else sum(values) / len(values)
 
 
 TRAINING_COLUMNS = (
-    _of_training("learned_from", "paths learned from"),
-    _of_training("epochs", "epochs"),
+    Column("seeds", "seeds", meaning="trainings; other figures are means over them",
+           value=lambda rows: len({row.training["seed"] for row in rows})),
+    _of_training("learned_from", "paths learned from", spec=".0f"),
+    _of_training("labels", "labels by"),
+    _of_training("rate", "learning rate", spec=".1g", meaning="the highest"),
+    _of_training("epochs", "epochs", spec=".0f"),
+    _of_training("best", "best epoch", spec=".0f", meaning="its network is kept"),
+    _of_training("loss", "loss", spec=".4f", meaning="of the last epoch, on the paths learned from"),
+    _of_training("unseen_loss", "validation loss", spec=".4f", meaning="of log h alone, of the best epoch"),
+    Column("flat", "flat", meaning="trainings that ended because the validation loss was flat", of="seeds",
+           value=lambda rows: len({row.training["seed"] for row in rows if row.training["flat"]})),
     _of_training("seconds", "training", "s", ".0f", meaning="of the processor, one thread"),
-)
+)  # fmt: skip
 PARAMETERS = _of_training("parameters", "parameters")
 
 
@@ -146,27 +165,22 @@ def quick_spec() -> DatasetSpec:
 def trained_networks(
     sequences: Sequences, folder: Path, wanted: Sequence[SequenceOptions], run: Run, epochs: int | None = None
 ) -> list[TrainedNetwork]:
-    """Return the `wanted` networks of a folder, training those that are missing; `epochs` overrides the options.
+    """Return the `wanted` networks of a folder, training those that are missing, for at most `epochs` epochs.
 
     Raises InputError if the folder holds networks of another training.
     """
-    options = [replace(each, epochs=epochs or each.epochs) for each in wanted]
-    total, done = sum(each.epochs for each in options), 0
     found = []
-    for each in options:
-
-        def show(epoch: Epoch, before: int = done) -> None:
-            run.progress(before + epoch.epoch, total)
-
+    for done, each in enumerate(wanted):
+        if epochs is not None:
+            each = replace(each, until=replace(each.until, most=epochs))
+        run.progress(done, len(wanted))
         loaded = load_network(folder / each.name, sequences, each)
         if loaded is None:
-            train_network(sequences, folder / each.name, each, on_epoch=show)
+            train_network(sequences, folder / each.name, each)
             loaded = load_network(folder / each.name, sequences, each)
         assert loaded is not None
-        done += each.epochs
-        run.progress(done, total)
-        network, seconds = loaded
-        found.append(TrainedNetwork(each.name, each, network, len(sequences.rows), seconds))
+        found.append(TrainedNetwork(each.name, each, loaded[0], len(sequences.rows), sequences.spec.planner, loaded[1]))
+    run.progress(len(wanted), len(wanted))
     return found
 
 

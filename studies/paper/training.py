@@ -1,15 +1,14 @@
-"""Train the paper's networks, by teacher forcing or on their own answers, one folder each; training is resumable.
+"""Train the paper's networks until their validation loss is flat, one folder each; training is resumable.
 
-Transformer and MLP learn by teacher forcing, on which the paper's explanation of their failures rests. The LSTM, which
-according to the paper is fed its own answers, is trained that way in the second half of its epochs. Noise injection
-follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As an option that is not
-in the paper, perturbed paths are solved again.
+Transformer and MLPs learn by teacher forcing, on which the paper's explanation of their failures rests. The LSTM, which
+according to the paper is fed its own answers, is fed those that it gives at that moment; gradients do not pass through
+them. Noise injection follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As
+an option that is not in the paper, perturbed paths are solved again.
 """
 
 import json
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,24 +17,69 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cfplan.errors import InputError
 from cfplan.files.whole import whole
 from cfplan.learning.checkpoints import CHECKPOINT, Epoch, resume, save_checkpoint
 from cfplan.learning.dataset_spec import Relabel
-from studies.paper.networks import Kind, SequenceNetwork, build_network
+from studies.paper.networks import SIZES, Kind, SequenceNetwork, build_network
 from studies.paper.recovery import nodal_time
 from studies.paper.sequences import Inputs, Sequences, select_inputs
 
-WEIGHTS = "weights.safetensors"
-FORCED = (Kind.TRANSFORMER, Kind.MLP)  # trained by teacher forcing in all epochs
-WARM_UP = 0.05  # fraction of the steps over which the learning rate rises; it then decays to zero along a cosine
+WEIGHTS, BEST = "weights.safetensors", "best.safetensors"  # of a finished training; of its best epoch until then
+WARM_UP = 200  # steps over which the learning rate rises at first
 CLIP = 1.0  # largest norm of the gradient
-YAW = 0.1  # weight of the squared error of cos ψ relative to that of log h, both normalised
+YAW = 0.01  # weight of the squared error of cos ψ relative to that of log h, both normalised
 NOISE_EPOCHS = 5  # epochs between new perturbations
 UNSEEN_SHARE = 0.05  # fraction of the paths on which each epoch is validated
-FEATURES = "paper 1"  # version of the networks' inputs
+FEATURES = "paper 2"  # version of the networks' inputs, and of what they are validated by
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UntilFlat:
+    """When a training ends: once its validation loss, of log h alone, is flat at every learning rate.
+
+    Most of what is left of the loss of cos ψ cannot be learned, because many yaws are nearly as good as each other; it
+    would hide that h still improves. The loss is flat after `patience` epochs in which it stayed above
+    (1 - `improvement`) of the least until then. The learning rate is then multiplied by `factor`, `cuts` times; when
+    the loss is flat once more, the training ends. Its network is that of the epoch with the least validation loss.
+    """
+
+    patience: int = 8  # epochs
+    improvement: float = 0.01  # relative
+    cuts: int = 3
+    factor: float = 1 / 3
+    most: int = 300  # epochs, after which a training ends in any case
+
+    def cuts_after(self, losses: Sequence[float]) -> int:
+        """Return how often the rate has been cut, or `cuts` + 1 if the training has ended, by validation losses."""
+        least, waited, cuts = np.inf, 0, 0
+        for loss in losses:
+            waited += 1
+            if loss < (1.0 - self.improvement) * least:
+                least, waited = loss, 0
+            if waited >= self.patience:
+                cuts, waited = cuts + 1, 0
+        return self.cuts + 1 if len(losses) >= self.most else cuts
+
+    def ended(self, losses: Sequence[float]) -> bool:
+        """Return whether the training has ended."""
+        return self.cuts_after(losses) > self.cuts
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Training:
+    """What is known of a finished training."""
+
+    epochs: int
+    best: int  # epoch with the least validation loss, whose network is kept
+    loss: float  # of the last epoch, on the paths learned from
+    unseen_loss: float  # of log h, of the best epoch, on validation paths
+    seconds: float  # s of processor time
+    flat: bool  # it ended because the validation loss was flat, not at the most epochs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,17 +90,39 @@ class SequenceOptions:
     inputs: Inputs = Inputs.ALL
     epsilon: float = 0.0  # m, noise injection
     relabel: Relabel = Relabel.KEEP  # label of perturbed paths
-    epochs: int = 14
+    until: UntilFlat = UntilFlat()
     batch: int = 50
     rate: float = 3e-3  # the highest learning rate; a third of it for Transformers
+    width: int | None = None  # of the network's layers; None: as in `SIZES`
+    slopes: float = 0.0  # weight of the squared error of differences between nodes; 0 in the paper's networks
     seed: int = 0
+
+    @property
+    def highest_rate(self) -> float:
+        """Return the learning rate before the first cut."""
+        return self.rate / (3.0 if self.kind in (Kind.TRANSFORMER, Kind.ENCODER) else 1.0)
 
     @property
     def name(self) -> str:
         """Return the network's name, unique within a study."""
-        noise = f"-{self.epsilon:g}" if self.epsilon else ""
-        noise += "-solved" if self.relabel is Relabel.SOLVE else ""
-        return f"{self.kind}{noise}" + ("" if self.inputs is Inputs.ALL else f"-{self.inputs.replace('/', '-')}")
+        return self.model + (f"-seed-{self.seed}" if self.seed else "")
+
+    @property
+    def model(self) -> str:
+        """Return the name of its tables' rows, which trainings with different seeds share."""
+        parts = (
+            str(self.kind),
+            f"{self.epsilon:g}" if self.epsilon else "",
+            "solved" if self.relabel is Relabel.SOLVE else "",
+            f"slopes-{self.slopes:g}" if self.slopes else "",
+            f"width-{self.width}" if self.width else "",
+            "" if self.inputs is Inputs.ALL else self.inputs.replace("/", "-"),
+        )
+        return "-".join(part for part in parts if part)
+
+
+OURS = SequenceOptions(kind=Kind.BIDIRECTIONAL, slopes=10.0)
+"""The network that is not in the paper: its loss counts errors of the slope of log h, which become acceleration."""
 
 
 def train_network(
@@ -74,37 +140,45 @@ def train_network(
     if len(sequences.rows) < 3:
         raise InputError(f"{len(sequences.rows)} paths are too few to learn from", where="dataset", hint="make more")
     torch.manual_seed(options.seed)
-    network = build_network(options.kind, options.inputs.width)
+    network = _built(options)
     unseen, known = _split(sequences, options.seed)
     network.set_units(_tensor(known.inputs, options), torch.from_numpy(known.answers))
     optimiser = torch.optim.Adam(network.parameters(), lr=options.rate)
     identity = _identity(sequences, options)
     log = resume(folder, identity, network, optimiser, torch.device("cpu"))
     perturb = _perturbations(known, options)
-    while len(log) < options.epochs:
+    while not options.until.ended([epoch.unseen_loss for epoch in log]):
         begun = time.process_time()
-        number = len(log)
-        loss, rate = _run_epoch(network, optimiser, known, perturb, options, number)
-        if not np.isfinite(loss):
-            raise InputError(f"the loss is {loss} in epoch {number + 1}", where=str(folder), hint="lower the rate")
+        learned, rate = _run_epoch(network, optimiser, known, perturb, options, log)
+        if not np.isfinite(learned):
+            raise InputError(f"the loss is {learned} in epoch {len(log) + 1}", where=str(folder), hint="lower the rate")
         judged = _judge(network, unseen, options)
-        log.append(Epoch(number + 1, loss, *judged, rate, time.process_time() - begun))
+        log.append(Epoch(len(log) + 1, learned, *judged, rate, time.process_time() - begun))
+        if log[-1] is _best(log):
+            _save(network, folder / BEST, {"epoch": len(log)})
         save_checkpoint(folder, identity, network, optimiser, log)
         on_epoch(log[-1])
+    network.load_state_dict(load_file(folder / BEST))
     network.eval()
-    _save(network, folder, identity, log)
+    best, validated = _best(log), [epoch.unseen_loss for epoch in log]
+    training = Training(
+        epochs=len(log), best=best.epoch, loss=log[-1].loss, unseen_loss=best.unseen_loss,
+        seconds=sum(epoch.seconds for epoch in log), flat=options.until.ended(validated[: options.until.most - 1]),
+    )  # fmt: skip
+    _save(network, folder / WEIGHTS, {"identity": identity, "training": asdict(training)})
+    for name in (CHECKPOINT, BEST):
+        (folder / name).unlink(missing_ok=True)
     return network
 
 
-def load_network(folder: Path, sequences: Sequences, options: SequenceOptions) -> tuple[SequenceNetwork, float] | None:
-    """Return the network of `folder` and its training's processor time, s, or None if it is not trained yet.
+def load_network(
+    folder: Path, sequences: Sequences, options: SequenceOptions
+) -> tuple[SequenceNetwork, Training] | None:
+    """Return the network of `folder` and its training, or None if it is not trained yet.
 
     Raises:
         InputError: the weights of another training, or damaged ones.
     """
-    from safetensors import SafetensorError, safe_open
-    from safetensors.torch import load_file
-
     file = folder / WEIGHTS
     if not file.is_file():
         return None
@@ -114,14 +188,14 @@ def load_network(folder: Path, sequences: Sequences, options: SequenceOptions) -
         card = json.loads(metadata["card"])
         if card["identity"] != json.loads(json.dumps(_identity(sequences, options))):
             raise InputError("holds another training", where=str(folder), hint="give another folder, or delete it")
-        network = build_network(options.kind, options.inputs.width)
+        network = _built(options)
         network.load_state_dict(load_file(file))
-        seconds = float(card["seconds"])
+        training = Training(**card["training"])
     except (OSError, SafetensorError, ValueError, LookupError, TypeError, RuntimeError) as error:
         reason = " ".join(str(error).split())[:120]
         raise InputError(f"cannot be read: {reason}", where=str(file), hint="delete it to train again") from None
     network.eval()
-    return network, seconds
+    return network, training
 
 
 def answer(network: SequenceNetwork, inputs: NDArray, chosen: Inputs = Inputs.ALL) -> NDArray:
@@ -132,11 +206,8 @@ def answer(network: SequenceNetwork, inputs: NDArray, chosen: Inputs = Inputs.AL
 
 
 def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
-    decided = asdict(options)
-    if options.relabel is Relabel.KEEP:
-        del decided["relabel"]  # older trainings have no such option
     return {
-        "options": json.loads(json.dumps(decided)),
+        "options": json.loads(json.dumps(asdict(options))),
         "data": {
             "dataset": json.loads(json.dumps(asdict(sequences.spec))),
             "rows": [int(sequences.rows[0]), int(sequences.rows[-1]), len(sequences.rows)],
@@ -166,9 +237,10 @@ def _perturbations(known: Sequences, options: SequenceOptions) -> Callable[[int]
 
 def _run_epoch(
     network: SequenceNetwork, optimiser: torch.optim.Optimizer, known: Sequences,
-    perturb: Callable[[int], Sequences], options: SequenceOptions, epoch: int,
+    perturb: Callable[[int], Sequences], options: SequenceOptions, log: Sequence[Epoch],
 ) -> tuple[float, float]:  # fmt: skip
-    """Train for one epoch; return the mean loss and the last learning rate."""
+    """Train for the epoch after those of the log; return the mean loss and the learning rate."""
+    epoch = len(log)
     random = np.random.default_rng([options.seed, 1, epoch])
     seen, answers = _tensor(known.inputs, options), torch.from_numpy(known.answers)
     if options.epsilon:
@@ -176,55 +248,69 @@ def _run_epoch(
         moved = torch.from_numpy(random.uniform(size=len(seen)) < 0.5)[:, None, None]
         seen = torch.where(moved, _tensor(noisy.inputs, options), seen)
         answers = torch.where(moved, torch.from_numpy(noisy.answers), answers)
-    order = torch.from_numpy(random.permutation(len(seen)))
-    batches = torch.split(order, options.batch)
-    total, rate = 0.0, 0.0
+    batches = torch.split(torch.from_numpy(random.permutation(len(seen))), options.batch)
+    rate, total = _rate(options, log), 0.0
     network.train()
-    for count, chosen in enumerate(batches):
-        rate = _rate(options, (epoch * len(batches) + count) / (options.epochs * len(batches)))
+    for count, chosen in enumerate(batches, start=epoch * len(batches)):
         for group in optimiser.param_groups:
-            group["lr"] = rate
-        forced = options.kind in FORCED or (options.kind is Kind.LSTM and 2 * epoch < options.epochs)
-        fed = answers[chosen] if forced else None
-        loss = _loss(network, network(seen[chosen], fed), answers[chosen])
+            group["lr"] = rate * min(1.0, (count + 1) / WARM_UP)
+        fed = _fed(network, seen[chosen], answers[chosen], options)
+        h, yaw = losses(network, network(seen[chosen], fed), answers[chosen], options)
+        value = h + YAW * yaw
         optimiser.zero_grad()
-        loss.backward()
+        value.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), CLIP)
         optimiser.step()
-        total += loss.item() * len(chosen)
-    return total / len(order), rate
+        total += value.item() * len(chosen)
+    return total / len(seen), rate
+
+
+def _fed(network: SequenceNetwork, seen: Tensor, answers: Tensor, options: SequenceOptions) -> Tensor:
+    """Return what a network is fed as its previous answers: the true ones, or its own at this moment."""
+    if options.kind is not Kind.LSTM:
+        return answers
+    with torch.no_grad():
+        own: Tensor = network(seen)
+    return own
 
 
 def _judge(network: SequenceNetwork, unseen: Sequences, options: SequenceOptions) -> tuple[float, float, float, float]:
-    """Return the loss and the errors of travel time on unseen paths, without teacher forcing."""
+    """Return the loss of log h and the errors of travel time on unseen paths, without teacher forcing."""
     network.eval()
     found = answer(network, unseen.inputs, options.inputs)
-    loss = _loss(network, torch.from_numpy(found), torch.from_numpy(unseen.answers)).item()
+    value = losses(network, torch.from_numpy(found), torch.from_numpy(unseen.answers), options)[0].item()
     errors = nodal_time(found, unseen.end) / nodal_time(unseen.answers, unseen.end) - 1.0
-    return loss, float(errors.mean()), float(np.abs(errors).mean()), float(np.quantile(np.abs(errors), 0.95))
+    return value, float(errors.mean()), float(np.abs(errors).mean()), float(np.quantile(np.abs(errors), 0.95))
 
 
-def _loss(network: SequenceNetwork, found: Tensor, wanted: Tensor) -> Tensor:
-    squares = (network.scaled(found) - network.scaled(wanted)).square().mean((0, 1))
-    return squares[0] + YAW * squares[1]
+def losses(network: SequenceNetwork, found: Tensor, wanted: Tensor, options: SequenceOptions) -> Tensor:
+    """Return the losses of log h and of cos ψ of answers, (B, N, 2)."""
+    errors = network.scaled(found) - network.scaled(wanted)
+    return errors.square().mean((0, 1)) + options.slopes * errors.diff(dim=1).square().mean((0, 1))
 
 
-def _rate(options: SequenceOptions, done: float) -> float:
-    """Return the learning rate after a fraction `done` of the steps."""
-    highest = options.rate / (3.0 if options.kind in (Kind.TRANSFORMER, Kind.ENCODER) else 1.0)
-    return highest * min(1.0, (done + 1e-3) / WARM_UP) * 0.5 * (1.0 + math.cos(math.pi * done))
+def _rate(options: SequenceOptions, log: Sequence[Epoch]) -> float:
+    """Return the learning rate of the epoch after those of the log."""
+    return options.highest_rate * options.until.factor ** options.until.cuts_after([epoch.unseen_loss for epoch in log])
+
+
+def _best(log: Sequence[Epoch]) -> Epoch:
+    """Return the first epoch with the least validation loss."""
+    return min(log, key=lambda epoch: epoch.unseen_loss)
+
+
+def _built(options: SequenceOptions) -> SequenceNetwork:
+    size = SIZES[options.kind]
+    return build_network(options.kind, options.inputs.width, size._replace(width=options.width or size.width))
 
 
 def _tensor(inputs: NDArray, options: SequenceOptions) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(select_inputs(inputs, options.inputs)))
 
 
-def _save(network: SequenceNetwork, folder: Path, identity: dict[str, Any], log: list[Epoch]) -> None:
-    """Write the weights atomically, and remove the checkpoint."""
-    from safetensors.torch import save_file
-
-    card = {"identity": identity, "seconds": sum(epoch.seconds for epoch in log), "last": asdict(log[-1])}
+def _save(network: SequenceNetwork, file: Path, card: dict[str, Any]) -> None:
+    """Write the weights and their card atomically."""
     weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
-    with whole(folder / WEIGHTS) as unfinished:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with whole(file) as unfinished:
         save_file(weights, unfinished, metadata={"card": json.dumps(card)})
-    (folder / CHECKPOINT).unlink(missing_ok=True)

@@ -4,6 +4,7 @@ The geometric controller flies the plan with the paper's motor lag. The measures
 of the motors (planned, and requested by the controller), speed above the limit, travel time and processor time to plan.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -30,7 +31,7 @@ from studies.paper.recovery import recover_profile
 from studies.paper.sequences import path_inputs
 from studies.paper.trained import NODES, PARAMETERS, TRAINING_COLUMNS, PaperPath, TrainedNetwork
 from studies.paper.training import answer
-from studies.runner.reductions import among, count, mean
+from studies.runner.reductions import Reduction, among, count, mean, quantile
 from studies.runner.result import Column, Table, table
 
 PAPER_LAG = 0.005  # s, time constant of the motors in the paper's version of RotorPy
@@ -185,11 +186,23 @@ def flown(flight: Any) -> bool:
 
 FAILED = Column("failed", "failures", of="paths", meaning=f"no plan, a crash, or {LOST:g} m from its place",
                 value=count(failed))  # fmt: skip
+_MEAN_DEVIATION = mean(lambda flight: LOST if failed(flight) else flight.deviation)
 DEVIATION = Column("deviation", "largest deviation", "m", ".3f", meaning=f"mean; a failure counts as {LOST:g} m",
-                   value=mean(lambda flight: LOST if failed(flight) else flight.deviation))  # fmt: skip
+                   value=_MEAN_DEVIATION)  # fmt: skip
+SPREAD = Column("deviation_spread", "± over seeds", "m", ".3f", meaning="half of the range of the seeds' means",
+                value=lambda rows: _half_range(rows, _MEAN_DEVIATION))  # fmt: skip
+DEVIATION_P90 = Column("deviation_p90", "90 % of paths", "m", ".3f", meaning="are within this",
+                       value=quantile(lambda flight: LOST if failed(flight) else flight.deviation, 0.9))  # fmt: skip
 DEVIATION_FLOWN = Column("deviation_flown", "without failures", "m", ".3f",
                          meaning="the same, of flights that did not fail",
                          value=among(flown, mean("deviation")))  # fmt: skip
+
+
+def _half_range(rows: Sequence[Any], value: Reduction) -> float:
+    """Return half the range of a value for the trainings with different seeds; NaN if there is only one."""
+    seeds = {row.training["seed"] for row in rows if row.training}
+    values = [value([row for row in rows if row.training["seed"] == seed]) for seed in seeds]
+    return (max(values) - min(values)) / 2.0 if len(values) > 1 else math.nan
 
 
 def planner_tables(
@@ -225,6 +238,8 @@ def planner_columns(what: str, printed: Mapping[tuple[str, str], PrintedRow]) ->
         Column("part", "paths"),
         Column("paths", "", meaning="number of them", value=count()),
         DEVIATION,
+        SPREAD,
+        DEVIATION_P90,
         DEVIATION_FLOWN,
         paper("deviation", unit="m", spec=".3f", meaning="the paper does not say which of the two"),
         Column("violation", "thrust violation", "N", ".4f",

@@ -49,6 +49,7 @@ SMALL_STUDIES = {
     "planners": "--paths 1",
     "random-faults": f"{LINE} --flights 2",
     "robustness": QUICK,
+    "search": QUICK,
     "simulators": QUICK,
     "steering": "--flights 1 --requests 5 --seconds 10",
     "stops": "",

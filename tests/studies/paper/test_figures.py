@@ -12,6 +12,7 @@ from studies.paper.figures import (
     draw_baselines,
     draw_long,
     draw_tracks,
+    draw_training,
     draw_yaw_consistency,
     write_figures,
 )
@@ -87,23 +88,37 @@ def test_figures_are_written_and_those_without_rows_name_the_command_that_makes_
         StudyResult(study, {}, (), rows).write(tmp_path / f"{study}.json")
 
     write("baselines", BASELINES)
-    written = {file.name: reason for file, reason in write_figures(tmp_path, tmp_path)}
+    written = {file.name: reason for file, reason in write_figures(tmp_path, tmp_path, tmp_path)}
     assert not written["paper-baselines.png"]
     assert f"python -m studies yaw-consistency -o {tmp_path}/yaw-consistency.json" in written["paper-yaw.png"]
     assert not (tmp_path / "paper-yaw.png").exists()
     write("yaw-consistency", PAIRS)
     write("hardware", flights())
-    written = dict(write_figures(tmp_path, tmp_path))
+    assert "python -m studies networks" in written["paper-training.png"]
+    for name in ("LSTM", "LSTM-seed-1", "MLP"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "weights.safetensors").touch()
+        (tmp_path / name / "log.csv").write_text("epoch,unseen_loss,rate\n1,0.5,0.003\n2,0.4,0.001\n")
+    written = dict(write_figures(tmp_path, tmp_path, tmp_path))
     assert not any(written.values())
     assert {file.stem for file in written} == {
         "paper-baselines",
         "paper-yaw",
         "paper-long",
+        "paper-training",
         *(f"paper-{name}" for name in NETWORKS),
     }
     assert all(file.stat().st_size > 10_000 for file in written)
 
 
+def test_each_model_has_a_panel_with_a_line_for_each_seed_and_a_mark_at_each_cut_of_the_rate():
+    logs = {name: [(0.5, 3e-3), (0.4, 3e-3), (0.3, 1e-3)] for name in ("LSTM", "LSTM-seed-1", "MLP")}
+    panels = [panel for panel in draw_training(logs).axes if panel.get_visible()]
+    assert [panel.get_title() for panel in panels] == ["LSTM", "MLP"]
+    assert [len(panel.lines) for panel in panels] == [4, 2]
+    assert panels[1].lines[1].get_xydata().tolist() == [[2.0, 0.4]]
+
+
 def test_a_folder_for_figures_must_be_there(tmp_path):
     with pytest.raises(InputError, match="no such folder"):
-        write_figures(tmp_path, tmp_path / "none")
+        write_figures(tmp_path, tmp_path / "none", tmp_path)

@@ -25,7 +25,7 @@ from studies.paper.hardware import (
 from studies.paper.networks import Kind, build_network
 from studies.paper.sequences import Inputs
 from studies.paper.trained import TrainedNetwork
-from studies.paper.training import SequenceOptions
+from studies.paper.training import SequenceOptions, Training
 from studies.paper.trials import TOPPQUAD, failed
 from studies.runner.cases import run_study
 
@@ -111,7 +111,10 @@ def test_a_network_without_an_answer_fails_every_flight_of_that_path():
     for tensor in network.parameters():
         torch.nn.init.constant_(tensor, np.nan)
     options = SequenceOptions(kind=Kind.MLP)
-    networks = {"text": {"MLP": TrainedNetwork("MLP", options, network, learned_from=0, training_seconds=0.0)}}
+    trained = Training(epochs=1, best=1, loss=1.0, unseen_loss=1.0, seconds=0.0, flat=True)
+    networks = {
+        "text": {"MLP": TrainedNetwork("MLP", options, network, learned_from=0, labels="expert", trained=trained)}
+    }
     paths = {LONG: long_path(USUAL), **hardware_paths(USUAL, 1)}
     plans = [plan for plan in plans_of(networks, paths).values() if plan.planner == "MLP"]
     flights = [flight for plan in plans for flight in measure(networks, paths, 3, plan)]

@@ -1,5 +1,6 @@
 """The paper's networks: inputs, teacher forcing and causality, and training that resumes after a stop."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -18,11 +19,12 @@ from cfplan.vehicle.timing import duration_of
 from studies.paper.networks import Kind, Size, build_network
 from studies.paper.recovery import nodal_time, recover_profile, yaw_of_cosines
 from studies.paper.sequences import Inputs, path_inputs, read_sequences, select_inputs
-from studies.paper.training import SequenceOptions, answer, load_network, train_network
+from studies.paper.training import SequenceOptions, UntilFlat, answer, load_network, losses, train_network
 
 SMALL = Size(8, 1)
-FED = [Kind.LSTM, Kind.TRANSFORMER, Kind.MLP]
-OPTIONS = SequenceOptions(epochs=3, batch=4)
+FED = [Kind.LSTM, Kind.TRANSFORMER, Kind.MLP, Kind.NEIGHBOURS]
+SIGNS = torch.tensor([1.0, -1.0]).repeat(50)[:, None]  # from node to node
+OPTIONS = SequenceOptions(until=UntilFlat(most=3), batch=4)
 
 
 @pytest.fixture(scope="module")
@@ -119,13 +121,43 @@ def test_training_learns_and_goes_on_where_it_stopped(sequences, tmp_path):
         assert torch.equal(tensor, resumed.state_dict()[name]), name
     loaded = load_network(tmp_path / "whole", sequences, OPTIONS)
     assert loaded is not None
-    read, seconds = loaded
-    assert seconds > 0
+    read, training = loaded
+    assert training.seconds > 0
+    assert (training.epochs, training.flat) == (3, False)
+    assert training.unseen_loss == min(epoch.unseen_loss for epoch in log) == log[training.best - 1].unseen_loss
     assert answer(read, sequences.inputs) == pytest.approx(answer(whole, sequences.inputs), abs=1e-6)
     with pytest.raises(InputError, match="another training"):
         load_network(tmp_path / "whole", sequences, replace(OPTIONS, rate=1e-3))
     with pytest.raises(InputError, match="another training"):
         load_network(tmp_path / "whole", sequences.part(slice(0, 6)), OPTIONS)
+
+
+def test_a_training_ends_when_its_validation_loss_is_flat_at_each_rate():
+    until = UntilFlat(patience=3, improvement=0.1, cuts=1, most=20)
+    falling = [0.8**n for n in range(10)]
+    assert until.cuts_after(falling) == 0
+    flat = falling + 2 * [0.95 * falling[-1]]  # it falls, but by too little
+    assert until.cuts_after(flat) == 0
+    flat += [0.95 * falling[-1]]
+    assert until.cuts_after(flat) == 1
+    assert not until.ended(flat)
+    lower = [*flat, *2 * [0.5 * falling[-1]]]  # at the lower rate it falls again
+    assert until.cuts_after(lower) == 1
+    assert until.ended(lower + 2 * [0.5 * falling[-1]])
+    assert until.ended([0.8**n for n in range(20)])
+    assert until.cuts_after([math.nan] * 3) == 1
+
+
+def test_a_loss_that_counts_slopes_is_larger_where_answers_are_rough(sequences):
+    known = network(Kind.BIDIRECTIONAL)
+    wanted = torch.from_numpy(sequences.answers)
+    known.set_units(torch.from_numpy(sequences.inputs), wanted)
+    steady, rough = (wanted * torch.tensor([1.1, 1.0]) ** sign for sign in (torch.ones(100, 1), SIGNS))
+    plain, slopes = OPTIONS, replace(OPTIONS, slopes=2.0)
+    usual = losses(known, steady, wanted, plain)[0].item()
+    assert losses(known, rough, wanted, plain)[0].item() == pytest.approx(usual, rel=1e-3)
+    assert losses(known, steady, wanted, slopes)[0].item() == pytest.approx(usual, rel=1e-3)
+    assert losses(known, rough, wanted, slopes)[0].item() == pytest.approx((1.0 + 2.0 * 4.0) * usual, rel=1e-3)
 
 
 def test_noise_moves_what_is_seen_by_at_most_epsilon(sequences):

@@ -1,10 +1,20 @@
 """Perturbed paths: the paper's Table 2."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from studies.paper.robustness import STUDY, Settings
-from studies.paper.robustness_tables import SCALES, SHIPPED, SHIPPED_FIXED
+from studies.paper.robustness_tables import (
+    FACTORS,
+    SCALES,
+    SHIPPED,
+    SHIPPED_FIXED,
+    RobustnessTrial,
+    papers_factor,
+    robustness_table,
+)
 from studies.runner.cases import run_study
 
 
@@ -35,6 +45,16 @@ def test_what_is_certified_is_followed_and_changes_with_its_path(quick):
     changes = [np.mean([t.h_variation for t in trials if t.epsilon == scale]) for scale in SCALES]
     assert changes[0] == 0.0
     assert changes[1] < changes[2] < changes[3]
+
+
+def test_the_papers_tolerance_is_where_its_clean_model_reaches_what_it_prints():
+    rising = np.linspace(0.2, 1.4, len(FACTORS)).clip(max=1.0).tolist()
+    clean = [RobustnessTrial("LSTM", 0.001, row, 0, reached=rising) for row in range(3)]
+    factor = papers_factor(clean)
+    assert np.interp(factor, FACTORS, rising) == pytest.approx(0.9)
+    (row,) = robustness_table(clean, "expert").rows
+    assert row["reached_papers"] == pytest.approx(row["paper_in_brt"]) == pytest.approx(0.9)
+    assert np.isnan(papers_factor([replace(clean[0], model="LSTM-0.1")]))
 
 
 def test_the_variation_of_answers_is_shown_for_each_scale_and_is_zero_for_fixed_yaw(quick):
