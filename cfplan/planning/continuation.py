@@ -5,22 +5,26 @@ A path is chosen from the state at a joint on (path/onward.py), and planned and 
 
 import math
 import time
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cfplan.deadline import Deadline
 from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
 from cfplan.geometry.continued import check_continued
 from cfplan.geometry.min_snap import check_points
 from cfplan.geometry.path import Path
+from cfplan.geometry.path_file import path_through
 from cfplan.geometry.yaw import YawMode
 from cfplan.numbers import coordinates
 from cfplan.planners.expert.expert import plan_early
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.path.onward import Departure, along, onward_paths, toward
+from cfplan.planning.path.search import search
 from cfplan.planning.path.variables import Knots
-from cfplan.planning.plan import check_endurance
+from cfplan.planning.plan import check_endurance, plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import default_nodes
 from cfplan.safety.certificate import certify
@@ -37,6 +41,7 @@ STOPPING = 0.6  # s of the path left, on which a vehicle that stops comes to res
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
 ROOM = 0.005  # fraction of each limit that plans leave to the plan that continues them
 BETWEEN = 0.6  # of that, which limits may use up between points: so much less is done to the plan
+SEARCH_TIMEOUT = 2.0  # s, of a vehicle that rests
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 COARSER = 0.85  # fraction of the usual intervals: such plans take 0.05 % longer, and nine tenths of the time to make
 
@@ -101,6 +106,8 @@ def plan_from_rest(
 ) -> Continuation:
     """Return a certified plan from rest at the first of the points, (K, 3) m, through the others to rest at the last.
 
+    Where the few steps that there are in motion find no path, the whole search does, in up to SEARCH_TIMEOUT.
+
     Raises:
         InputError: they are no waypoints.
         InfeasibleError: one lies outside the space, or none of the paths tried can be flown.
@@ -112,6 +119,13 @@ def plan_from_rest(
     made = _first_certified(toward(departure, given[1:], limits), departure, limits, speed, leave_room=True)
     if isinstance(made, Continuation):
         return made
+    found = search(path_through(given), limits, Deadline.after(SEARCH_TIMEOUT)).knots
+    with suppress(InfeasibleError):
+        planned = plan(
+            found.path, limits.airframe, limits, planner=PLANNER, yaw_angle=yaw_angle,
+            speed_factor=min(speed / limits.plan.speed, 1.0),
+        )  # fmt: skip
+        return Continuation(planned, tuple(found.breaks[found.waypoint[1:]].tolist()))
     raise NoWayError(
         f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint="give other waypoints"
     )

@@ -233,3 +233,14 @@ def test_what_are_no_waypoints_is_refused(flown, limits, waypoints):
 def test_after_its_end_a_plan_is_not_continued(flown, limits):
     with pytest.raises(InputError, match="nothing moves"):
         continue_plan(flown.trajectory, flown.trajectory.duration + 0.1, [[0, 0, 1]], limits)
+
+
+def test_short_hops_from_rest_are_flown(limits):
+    """Less than 0.4 m apart, where the few steps of the quick search find nothing."""
+    random = np.random.default_rng(7)
+    for _ in range(12):
+        first = random.uniform([-1.5, -3.0, 0.5], [1.5, 3.0, 1.5])
+        last = first + random.uniform(-0.3, 0.3, 3)
+        made = plan_from_rest([first, last], limits)
+        assert made.plan.certificate.passed
+        np.testing.assert_allclose(made.plan.path(made.reached[-1]), last, atol=1e-9)

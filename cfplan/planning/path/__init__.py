@@ -1,3 +1,3 @@
 """The choice of the fastest path through waypoints."""
 
-__all__ = ["choice", "onward", "variables"]
+__all__ = ["choice", "onward", "search", "variables"]
