@@ -4,7 +4,6 @@ __all__ = [
     "air_planner",
     "beside",
     "certified_flight",
-    "compiled_calls",
     "export_flight",
     "from_programs",
     "lead",
@@ -17,6 +16,7 @@ __all__ = [
     "proposal_chain",
     "replan",
     "request_queue",
+    "small_flight",
     "stepped_planner",
     "steps",
 ]

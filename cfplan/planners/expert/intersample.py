@@ -102,12 +102,7 @@ def _laid_out(
     return allowance, begins, interval, within, s
 
 
-def _extremes_interpreted(measured: NDArray, begins: NDArray) -> NDArray:
-    highest, lowest = (extreme.reduceat(measured, begins[:-1], axis=1) for extreme in (np.maximum, np.minimum))
-    return np.concatenate([highest, lowest], axis=1)
-
-
-@njit(interpreted=_extremes_interpreted)
+@njit
 def _extremes(measured: NDArray, begins: NDArray) -> NDArray:
     """Return the highest of each row, (MEASURES, P), in each interval, then the lowest, (MEASURES, 2 N)."""
     rows, count = measured.shape[0], len(begins) - 1

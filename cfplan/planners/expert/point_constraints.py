@@ -50,8 +50,3 @@ def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray
 def variables(free_yaw: bool) -> int:
     """Return how many numbers decide a point, and how many spline coefficients those."""
     return 7 if free_yaw else 4
-
-
-def family(free_yaw: bool) -> str:
-    """Return the name of the functions' family."""
-    return "free" if free_yaw else "given"

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.kernel import Kernels, kernels_at_hand
+from cfplan.planners.expert.kernel import Kernels
 from cfplan.planners.expert.layout import variables_of
 from cfplan.planners.expert.problem import FLOOR, Problem
 from cfplan.planners.solver.barrier import bounds_of
@@ -31,13 +31,13 @@ _FREELY = {"contract", "reassoc", "nsz"}  # freedom in the order of sums that le
 class SplineProgram:
     """f and g by v, see interior_point.NonlinearProgram; and the way from tables of coefficients to v and back."""
 
-    def __init__(self, problem: Problem, kernels: type[Kernels] | None = None) -> None:
+    def __init__(self, problem: Problem) -> None:
         """Fix what a boundary state decides at its value in the problem's table."""
         self._variables = it = variables_of(problem.layout, problem.ends.held, problem.rests)
         self._fixed = problem.coefficients
         self._fixed_local = problem.coefficients.ravel()[it.local]
         self._linear = it.sparsity.linear.shape[1]
-        self._kernels = (kernels or kernels_at_hand())(
+        self._kernels = Kernels(
             problem.layout.shape.free_yaw, problem.point_data, problem.common, OBJECTIVE_SCALE * problem.penalties,
             self._linear,
         )  # fmt: skip
@@ -244,37 +244,7 @@ def _add_time(local, scale, gradients, hessian):
                     row[i] += bend[i] * both
 
 
-def _intervals(runs):
-    """Return the interval of each point of all runs, (P,)."""
-    return np.concatenate([np.arange(first, first + count) for _, first, count in runs.tolist()])
-
-
-def _assemble_interpreted(at_points, sparsity, terms, local, scale, gradients, matrix):
-    (k, count), kinds, linear = local.shape, len(terms), sparsity.linear
-    interval, linear_interval = _intervals(sparsity.runs), _intervals(sparsity.linear_runs)
-    by_interval = np.array([np.bincount(interval, row, count) for row in at_points])
-    of_gradients, of_hessian = by_interval[: kinds * k], by_interval[kinds * k :]
-    of_h = linear.shape[1] - sparsity.of_yaw
-    for rows, first in ((slice(0, of_h), 0), (slice(of_h, None), k - 4)):
-        weights, at = linear[:, rows], linear_interval[rows]
-        of_rows = terms[:, terms.shape[1] - linear.shape[1] :][:, rows]
-        for b in range(4):
-            for kind in range(1, kinds):
-                of_gradients[kind * k + first + b] += np.bincount(at, of_rows[kind] * weights[b], count)
-            for a in range(b, 4):
-                added = np.bincount(at, of_rows[0] * weights[b] * weights[a], count)
-                of_hessian[_entry(first + b, first + a, k)] += added
-    _add_time(local, scale, of_gradients, of_hessian)
-    free = sparsity.slots >= 0
-    for kind in range(kinds):
-        of_kind = of_gradients[kind * k : (kind + 1) * k]
-        gradients[kind] = np.bincount(sparsity.slots[free], of_kind[free], gradients.shape[1])
-    entry, times = sparsity.entries
-    free = entry >= 0
-    matrix[:] = np.bincount(entry[free], (times * of_hessian)[free], matrix.size).reshape(matrix.shape)
-
-
-@njit(interpreted=_assemble_interpreted, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
     """Add up gradients and matrix, zero at first, from the kernel's at points, the linear constraints and the time."""
     slots, entries, kinds = sparsity.slots, sparsity.entries, len(terms)
@@ -295,16 +265,7 @@ def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
                 flat[entries[0, e, i]] += entries[1, e, i] * of_hessian[e, i]
 
 
-def _jvp_interpreted(jacobian, sparsity, dv):
-    local = np.where(sparsity.slots >= 0, dv[sparsity.slots], 0.0)
-    by_coefficient = jacobian.reshape(len(local), -1, jacobian.shape[1])
-    of_points = np.einsum("arp,ap->rp", by_coefficient, local[:, _intervals(sparsity.runs)])
-    of_linear = np.empty(sparsity.linear.shape[1])
-    _weigh(sparsity, local, of_linear)
-    return np.append(of_points, of_linear)
-
-
-@njit(interpreted=_jvp_interpreted, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _jvp(jacobian, sparsity, dv):
     """Return J dv, (m,); `jacobian` is the kernel's at points."""
     k, points = len(sparsity.slots), jacobian.shape[1]
