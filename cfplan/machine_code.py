@@ -241,7 +241,8 @@ def njit(function: Callable[..., Any] | None = None, *, allocates: bool = True, 
     if function is None:
         return lambda each: njit(each, allocates=allocates, **options)
     made: Any = numba.njit(**{"_nrt": allocates, "no_cfunc_wrapper": True, **options})(function)
-    if hasattr(made, "_cache") and cache_writable():  # it has none if numba is switched off
+    with_source = os.path.exists(function.__code__.co_filename)  # else it was typed in
+    if hasattr(made, "_cache") and with_source and cache_writable():  # numba may be switched off
         made._cache = _Cache(function)
     return made
 
