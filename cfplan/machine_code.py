@@ -140,9 +140,13 @@ class _Cache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a compiled function, unless sources have changed since this process began; a full disk is no error."""
-        if hash_of_sources() == KEY:
-            with suppress(OSError), self._locked():
-                super().save_overload(sig, data)
+        _listener.on_start(None)  # this takes time as compiling does
+        try:
+            if hash_of_sources() == KEY:
+                with suppress(OSError), self._locked():
+                    super().save_overload(sig, data)
+        finally:
+            _listener.on_end(None)
 
 
 class _Library(JITCodeLibrary):
