@@ -13,9 +13,8 @@ from numba.core import event
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import refine
-from cfplan.planners.expert.windows import WindowSize
+from cfplan.planners.expert.expert import plan_expert, refine
+from cfplan.planners.expert.tuning import WindowSize
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan import plan

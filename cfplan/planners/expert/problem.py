@@ -12,6 +12,7 @@ from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import CONTINUOUS, Violation, spread
 from cfplan.planners.expert.layout import Layout
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.task import FREE_START
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
@@ -21,16 +22,6 @@ from cfplan.vehicle.profile import BoundaryState, SpeedProfile, yaw_within
 from cfplan.vehicle.profile_spline import spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
-MARGIN = 1e-3  # share by which limits are tightened, for what happens between points
-BLEND_INTERVALS = 5  # over which that margin grows from nothing, next to a boundary state that may lie at a limit
-# By how much limits are tightened around a joint, and over how many intervals on each side, so that the next window
-# has room.
-JOINT_MARGIN, AROUND_JOINT = 0.01, 6
-BOUNDARY_TOLERANCE = 0.1  # by which rows that a boundary state alone decides may exceed their limits: they are checked
-OVERTIGHTENING = 1.5  # times a violation between points, by which limits are lowered: the peak falls by less
-CEILING = 20.0  # h at most, where the path nearly stands still, in squares of the speed limit
-FLOOR = 1e-4  # coefficients of x at least
-BRISK = 4.0  # times the typical speed of a flight, above which a speed limit is too far off to measure by
 REST = 1e-9  # |γ'| below which a path stands still
 
 
@@ -75,13 +66,13 @@ class Segment:
 
 
 def slowness_of(h: NDArray, limits: PlanLimits) -> float:
-    """Return the speed limit over BRISK times the typical speed of some h, (K,); at least 1.
+    """Return the speed limit over `speed_cap_ratio` times the typical speed of some h, (K,); at least 1.
 
-    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to FLOOR, and
-    the search would end before it began.
+    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to its `floor`,
+    and the search would end before it began.
     """
     middle = np.sort(h)[(len(h) - 1) // 2 : len(h) // 2 + 1]  # one or two: np.median() takes ten times as long
-    return max(1.0, limits.speed / (BRISK * (float(middle[0] + middle[-1]) / 2.0) ** 0.5))
+    return max(1.0, limits.speed / (TUNING.speed_cap_ratio * (float(middle[0] + middle[-1]) / 2.0) ** 0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +107,12 @@ def build_problem(
     layout, path, limits, ends = segment.layout, segment.path, segment.limits, segment.ends
     nodes = layout.shape.nodes
     step, unit = path.end / nodes, segment.unit
-    margin = MARGIN * (1.0 - held_by(ends, nodes))
+    margin = TUNING.margin * (1.0 - held_by(ends, nodes))
     if ends.joint is not None:
-        margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
+        margin[ends.joint - TUNING.around_joint : ends.joint + TUNING.around_joint] = TUNING.joint_margin
     s = layout.speed_s * step
     speed = np.full(len(s), allowed_speed(limits.speed, segment.caps, s), dtype=float)
-    ceiling = CEILING * segment.slowness**2
+    ceiling = TUNING.ceiling * segment.slowness**2
     nominal, highest = _highest(path(s, 1), layout.speed_interval, margin, speed, unit, ceiling)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:
@@ -155,8 +146,8 @@ def _highest(
 
 def interval_of(segment: Segment, coefficients: NDArray) -> float:
     """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
-    slowness = float((1.0 / np.sqrt(segment.unit * np.maximum(coefficients[:, 0], FLOOR))).sum()) / len(coefficients)
-    return segment.path.end / segment.layout.shape.nodes * slowness
+    h = segment.unit * np.maximum(coefficients[:, 0], TUNING.floor)
+    return segment.path.end / segment.layout.shape.nodes * float((1.0 / np.sqrt(h)).sum()) / len(h)
 
 
 def _point_data(segment: Segment, step: float) -> NDArray:
@@ -206,7 +197,7 @@ def _tightened_by_margin(
             if bounded[row, p]:
                 s = interval[p] + place[p]
                 decided = s in (first, last) and not jumps[row]
-                tighter = -BOUNDARY_TOLERANCE if decided else 2.0 * margin[interval[p]]  # as most rows are squares
+                tighter = -TUNING.boundary_tolerance if decided else 2.0 * margin[interval[p]]  # most are squares
                 low[row, p], high[row, p] = lower[row] + tighter, upper[row] - tighter
     return low, high
 
@@ -217,7 +208,7 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
     `rows`, (ROWS, P), is what the solution has at the points: a peak far from every point lowers the limits from there.
     """
     layout = problem.layout
-    over, under = (OVERTIGHTENING * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
+    over, under = (TUNING.overtightening * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
     lower, upper = _lowered(
         problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper,
         under, over,
@@ -265,7 +256,7 @@ def _lowered(
 
 
 def held_by(ends: Ends, nodes: int) -> NDArray:
-    """Return (N,): 1 next to a boundary state, 0 from BLEND_INTERVALS on.
+    """Return (N,): 1 next to a boundary state, 0 from TUNING.blend on.
 
     A state may lie at a limit, and what follows is all but decided: there is no room to lower limits there.
     """
@@ -274,7 +265,7 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
     free = np.ones(nodes)
     distance = np.arange(nodes) + 0.5
     if ends.start and not ends.continues:
-        free = np.minimum(free, (distance - 1.5) / BLEND_INTERVALS)
+        free = np.minimum(free, (distance - 1.5) / TUNING.blend)
     if ends.end:
-        free = np.minimum(free, (nodes - distance - 1.5) / BLEND_INTERVALS)
+        free = np.minimum(free, (nodes - distance - 1.5) / TUNING.blend)
     return 1.0 - np.clip(free, 0.0, 1.0)

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.expert import segment_of
+from cfplan.planners.expert.expert import Attempt, early, refining, rejection_reason, segment_of, solve
 from cfplan.planners.expert.kernel import Kernels
 from cfplan.planners.expert.problem import Problem, build_problem, interval_of
-from cfplan.planners.expert.search import Attempt, early_start, refining_starts, rejection_reason, solve
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.timing import duration_of
@@ -44,8 +43,8 @@ def sensitivity(task: PlanningTask, near: NDArray | None = None) -> Sensitivity 
     segment = segment_of(task, task.nodes)
     problem = build_problem(segment, task.yaw_angle)
     interval = interval_of(segment, problem.coefficients)
-    tries = [(near, refining_starts(interval)[:1])] if near is not None else []
-    for coefficients, starts in [*tries, (problem.coefficients, (early_start(interval),))]:
+    tries = [(near, refining(interval).starts[:1])] if near is not None else []
+    for coefficients, starts in [*tries, (problem.coefficients, early(interval).starts)]:
         attempt = solve(problem, coefficients, starts, task.deadline)
         if not rejection_reason(attempt, segment):
             duration = float(duration_of(segment.profile(attempt.coefficients)))

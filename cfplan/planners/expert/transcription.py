@@ -15,7 +15,8 @@ from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.kernel import Kernels
 from cfplan.planners.expert.layout import variables_of
-from cfplan.planners.expert.problem import FLOOR, Problem
+from cfplan.planners.expert.problem import Problem
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.solver.barrier import bounds_of
 from cfplan.planners.solver.interior_point import Linearisation, Values
 from cfplan.vehicle.profile_spline import weights_at
@@ -97,7 +98,7 @@ def _limits(lower, upper, highest, linear, positive, yaw):
     for j in range(len(highest)):
         high[points + j] = highest[j]
     for j in range(positive):
-        low[behind + j] = FLOOR
+        low[behind + j] = TUNING.floor
     if behind + positive < len(low):  # the last is where yaw starts
         low[-1], high[-1] = yaw
     return low, high

@@ -11,14 +11,13 @@ from cfplan.geometry.random_paths import random_waypoints
 from cfplan.machine_code import njit
 from cfplan.planners.expert import expert
 from cfplan.planners.expert.derivatives import point_kernels
-from cfplan.planners.expert.expert import plan_expert
+from cfplan.planners.expert.expert import FROM_GUESS, Attempt, plan_expert, solve
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import Violation
 from cfplan.planners.expert.kernel import Kernels
 from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.point_constraints import ROWS, Penalties
 from cfplan.planners.expert.problem import Ends, Segment, build_problem, tightened
-from cfplan.planners.expert.search import COLD_START, Attempt, solve
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE, SplineProgram
 from cfplan.planners.expert.vector_code import generator
 from cfplan.planners.solution import Status
@@ -114,7 +113,7 @@ def test_what_a_problem_hands_out_stays_as_it_is():
 def test_rows_of_the_program_are_what_the_flatness_map_gives():
     shape = Shape(30, False)
     problem, segment = problem_of(shape), segment_of(shape)
-    attempt = solve(problem, problem.coefficients, COLD_START)
+    attempt = solve(problem, problem.coefficients, FROM_GUESS)
     trajectory = Trajectory(PATH, segment.profile(attempt.coefficients), HARDWARE.airframe)
     layout = problem.layout
     state = trajectory.at(trajectory.time_at(layout.s * problem.step))
