@@ -30,14 +30,15 @@ from cfplan.deadline import NEVER, Deadline
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.initial_guess import guess_spline, led_into, lowered
 from cfplan.planners.expert.intersample import DensePath
-from cfplan.planners.expert.layout import Shape, layout_of
 from cfplan.planners.expert.problem import (
     Ends,
     Problem,
     Segment,
+    Shape,
     build_problem,
     held_by,
     interval_of,
+    layout_of,
     slowness_of,
     tightened,
 )

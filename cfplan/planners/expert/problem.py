@@ -1,7 +1,12 @@
-"""The numbers of one speed-profile problem: a stretch of path and its limits at points, and how limits are lowered."""
+"""A speed-profile problem: a stretch of path, the points at which its limits hold, and how these are lowered.
+
+Its variables are coefficients of splines on the grid: a cubic one of x = h/unit and, where yaw is free, a quadratic one
+of yaw (transcription.py). Numbers are in node units: s counted in intervals of the grid.
+"""
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +16,11 @@ from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import CONTINUOUS, Violation, spread
-from cfplan.planners.expert.layout import Layout
 from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.task import FREE_START
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
+from cfplan.vehicle import measures
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile, yaw_within
@@ -23,6 +28,74 @@ from cfplan.vehicle.profile_spline import spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
 REST = 1e-9  # |γ'| below which a path stands still
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What a problem's structure depends on."""
+
+    nodes: int
+    free_yaw: bool
+    turning_limited: bool = False  # whether angular acceleration has a limit of its own
+    end_intervals: tuple[int, int] = (3, 3)  # intervals at each end with more points inside
+    end_places: tuple[float, ...] = (0.2, 0.5, 0.8)
+    middle_places: tuple[float, ...] = (0.5,)  # points inside every other interval
+    speed_places: tuple[float, ...] = (0.5,)  # where the speed limit holds besides the nodes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where the points lie: the first of all intervals, then the second of all, and so on.
+
+    The last one is repeated, without limits, until they fill the kernels' lanes.
+    """
+
+    shape: Shape
+    interval: NDArray  # (P,) of each point
+    place: NDArray  # (P,) in its interval, 0 to 1
+    weight: NDArray  # (P,) of the penalties: 1 at the left end of an interval, else 0
+    bounded: NDArray  # (ROWS, P) whether each row of point_constraints has its limits there
+    speed_interval: NDArray  # (N + 1 + N speed places,) where the speed limit holds: at the nodes, and then between
+    speed_place: NDArray  # likewise
+
+    @property
+    def s(self) -> NDArray:
+        """Return where the points lie, (P,), in intervals from the first node."""
+        return self.interval + self.place
+
+    @property
+    def speed_s(self) -> NDArray:
+        """Return where the speed limit holds, in intervals."""
+        return self.speed_interval + self.speed_place
+
+
+@lru_cache(maxsize=128)
+def layout_of(shape: Shape) -> Layout:
+    """Return the layout of a shape, made once a process."""
+    all_rows = np.ones(point_constraints.ROWS, dtype=bool)
+    all_rows[measures.ANGULAR_ACCELERATION] = shape.turning_limited
+    jumping = all_rows & point_constraints.JUMPS
+    k = np.arange(shape.nodes)
+    at_end = (k < shape.end_intervals[0]) | (k >= shape.nodes - shape.end_intervals[1])
+    of_end, of_middle = (0.0, *shape.end_places, 1.0), (0.0, *shape.middle_places, 1.0)
+    intervals, places = [], []
+    for j in range(max(len(of_end), len(of_middle))):
+        here = np.where(at_end, j < len(of_end), j < len(of_middle))
+        intervals.append(k[here])
+        places.append(np.where(at_end, (of_end + (1.0,) * j)[j], (of_middle + (1.0,) * j)[j])[here])
+    interval, place = np.concatenate(intervals), np.concatenate(places)
+    count, padding = len(interval), -len(interval) % point_constraints.LANES
+    interval, place = (np.append(each, np.repeat(each[-1:], padding)) for each in (interval, place))
+    # At an interval's right end the rest holds as it does at the next one's left end.
+    inner_right = (place == 1.0) & (interval < shape.nodes - 1)
+    bounded = np.where(inner_right, jumping[:, None], all_rows[:, None])
+    bounded[:, count:] = False
+    weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once an interval
+    weight[count:] = 0.0
+    node = np.arange(shape.nodes + 1)
+    speed_interval = np.concatenate([np.minimum(node, shape.nodes - 1), np.tile(node[:-1], len(shape.speed_places))])
+    speed_place = np.concatenate([(node == shape.nodes) * 1.0, np.repeat(np.array(shape.speed_places), shape.nodes)])
+    return Layout(shape, interval, place, weight, bounded, speed_interval, speed_place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +159,7 @@ class Problem:
     step: float  # of s, an interval
     point_data: NDArray  # (POINT_DATA, P)
     common: NDArray  # (COMMON_DATA,)
-    penalties: NDArray  # (3,) weights
+    penalties: NDArray  # (3,) weights, of Penalties
     lower: NDArray  # (ROWS, P) bounds of the rows at points, infinite where there is none
     upper: NDArray  # (ROWS, P)
     highest: NDArray  # x at most where layout.speed_s says, by the speed limit
@@ -97,7 +170,6 @@ class Problem:
 def build_problem(
     segment: Segment,
     yaw_angle: float = 0.0,
-    penalties: point_constraints.Penalties | None = None,
     coefficients: NDArray | None = None,
 ) -> Problem:
     """Return the problem of a segment. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more.
@@ -126,7 +198,7 @@ def build_problem(
     return Problem(
         layout, ends, (nominal[0] < REST, nominal[nodes] < REST), unit, step, _point_data(segment, step),
         point_constraints.common_data(segment.airframe, limits, unit / step**2),
-        np.array((penalties or point_constraints.Penalties()).weights()), lower, upper, highest,
+        np.array(TUNING.penalties), lower, upper, highest,
         (yaw_angle, yaw_angle + FREE_START), coefficients,
     )  # fmt: skip
 

@@ -1,11 +1,18 @@
 """The speed-profile problem as a nonlinear program of its free spline coefficients.
 
-Its constraints are the kernel's rows at all points, and then what is linear in the coefficients: h where the speed
-limit holds, that coefficients of h are positive, and where yaw starts.
+Coefficients lie in a table: N+3 of h in its first column and, where yaw is free, N+2 of yaw in its second. Read row by
+row it is the vector v of variables, in which an interval's coefficients lie side by side. A boundary state fixes three
+coefficients of h and two of yaw; at a rest the first four of h have one value, so that h is constant in that interval,
+and the first two of yaw.
+
+Constraints are the kernel's rows at all points, and then what is linear in the coefficients: h where the speed limit
+holds, that coefficients of h are positive, and where yaw starts.
 """
 
 import math
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -14,11 +21,11 @@ from numpy.typing import NDArray
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.kernel import Kernels
-from cfplan.planners.expert.layout import variables_of
-from cfplan.planners.expert.problem import Problem
+from cfplan.planners.expert.problem import Layout, Problem
 from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.solver.barrier import bounds_of
 from cfplan.planners.solver.interior_point import Linearisation, Values
+from cfplan.vehicle import yaw_spline
 from cfplan.vehicle.profile_spline import weights_at
 
 OBJECTIVE_SCALE = 1000.0  # of the cost in seconds, so that multipliers are about 1
@@ -26,7 +33,96 @@ OBJECTIVE_SCALE = 1000.0  # of the cost in seconds, so that multipliers are abou
 _PLACES = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
 _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 _AT_PLACES = np.stack(weights_at(_PLACES), axis=-1)
+_FIXED = -1
 _FREELY = {"contract", "reassoc", "nsz"}  # freedom in the order of sums that lets NaN survive
+
+
+class Sparsity(NamedTuple):
+    """How v, the intervals and the points belong together, for compiled loops.
+
+    Points, and linear rows, lie in runs: of as many intervals, one after another. (R, 3): the first point of each run,
+    its interval, and how many. So the loops pass through memory in order, several numbers at a time, which takes
+    unsigned numbers: compiled code looks at the sign of an index.
+    """
+
+    runs: NDArray  # of the P points
+    slots: NDArray  # (k, N) entry of v of each of an interval's coefficients, -1 where it is fixed
+    entries: NDArray  # (2, k(k+1)/2, N) of the flattened matrix for each pair, -1 if fixed, and how often it counts
+    linear: NDArray  # (4, E) weights of four of an interval's coefficients in each linear row
+    linear_runs: NDArray  # of the E rows
+    of_yaw: int  # how many of the linear rows, the last ones, weigh yaw's coefficients, not those of h
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Variables:
+    """Which coefficients are variables."""
+
+    slots: NDArray  # (N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed
+    local: NDArray  # (k, N) where an interval's coefficients lie in the flattened table
+    positive: int  # how many coefficients of h have an entry of v of their own
+    size: int  # of v
+    band: int  # how far apart two coefficients that meet can be
+    sparsity: Sparsity
+
+
+@lru_cache(maxsize=128)
+def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> Variables:
+    """Return the variables, where each end is held by a boundary state or not, and at rest or not."""
+    nodes, free_yaw = layout.shape.nodes, layout.shape.free_yaw
+    table, own = _slots(nodes, 2 if free_yaw else 1, held, rests)
+    k = point_constraints.variables(free_yaw)
+    local = (
+        np.array([0, 1, 2, 3, 0, 1, 2][:k])[:, None] + np.arange(nodes),
+        np.array([0, 0, 0, 0, 1, 1, 1][:k])[:, None],
+    )
+    slots = table[local]
+    free = np.where(slots >= 0, slots, slots.max(axis=0))
+    band = int((free.max(axis=0) - free.min(axis=0)).max())
+    right, left = np.array([(a, b) for b in range(k) for a in range(b, k)]).T
+    low, high = np.minimum(slots[left], slots[right]), np.maximum(slots[left], slots[right])
+    entry = np.where(low >= 0, high * (band + 1) + high - low, _FIXED)
+    entries = np.stack([entry, np.where((low == high) & (left != right)[:, None], 2, 1)])
+    positive = np.flatnonzero(own[:, 0])
+    sparsity = Sparsity(_runs(layout.interval), slots, entries, *_linear_rows(layout, positive))
+    return Variables(table, local[0] * table.shape[1] + local[1], len(positive), table.size, band, sparsity)
+
+
+def _slots(nodes: int, columns: int, held: tuple[bool, bool], rests: tuple[bool, bool]) -> tuple[NDArray, NDArray]:
+    """Return the entry of v of each coefficient, -1 where it is fixed; and which have an entry of their own."""
+    own = np.arange((nodes + 3) * columns).reshape(nodes + 3, columns)
+    slots = own.copy()
+    for end, (h, yaw) in enumerate((
+        ([0, 1, 2, 3], [0, 1]), ([nodes + 2, nodes + 1, nodes, nodes - 1], [nodes + 1, nodes])
+    )):  # fmt: skip
+        if held[end]:
+            slots[h[:3], 0] = _FIXED
+            if columns == 2:
+                slots[yaw, 1] = _FIXED
+        elif rests[end]:
+            slots[h, 0] = slots[h[3], 0]
+            if columns == 2:
+                slots[yaw, 1] = slots[yaw[1], 1]
+    if columns == 2:
+        slots[-1, 1] = _FIXED  # yaw has a coefficient less
+    return slots, slots == own
+
+
+def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, int]:
+    """Return (weights (4, E), runs, how many of yaw): h where the speed limit holds, its coefficients, yaw's start."""
+    of_positive = np.clip(positive - 1, 0, layout.shape.nodes - 1)
+    weights = [np.stack(weights_at(layout.speed_place)), np.eye(4)[positive - of_positive].T]
+    interval = [layout.speed_interval, of_positive]
+    if layout.shape.free_yaw:
+        weights.append(np.append(0.0, yaw_spline.AT_NODE[0])[:, None])
+        interval.append(np.zeros(1, dtype=int))
+    linear = np.ascontiguousarray(np.concatenate(weights, axis=1))
+    return linear, _runs(np.concatenate(interval)), int(layout.shape.free_yaw)
+
+
+def _runs(interval: NDArray) -> NDArray:
+    """Return the runs, (R, 3), in which these intervals follow one another."""
+    first = np.flatnonzero(np.diff(interval, prepend=-2) != 1)
+    return np.stack([first, interval[first], np.diff(first, append=len(interval))], axis=1).astype(np.uint64)
 
 
 class SplineProgram:

@@ -14,8 +14,32 @@ class WindowSize(NamedTuple):
     ahead: int  # beyond those, planned and not kept
 
 
+class Penalties(NamedTuple):
+    """What a second of flight costs beyond its time; keeps solutions smooth and yaw from drifting."""
+
+    angular_acceleration: float = 1e-6  # s⁴/rad², per squared angular acceleration
+    yaw_rate: float = 1e-2  # s²/rad², per squared yaw rate; free yaw only
+    roughness: float = 1e-3  # s, per squared third derivative of h over h, in grid steps, an interval
+
+
+class Guess(NamedTuple):
+    """Where a search from a guess begins, initial_guess.py."""
+
+    highest: float = 6.0  # h at most, where the path nearly stands still, in squares of the speed limit
+    usage: float = 0.7  # of each limit
+    smoothing: float = 2.0
+    h_blend: float = 5.0  # over which h comes away from a boundary state: in fewer it jerks, in more it cannot brake
+    yaw_blend: float = 4.0
+    lowered_from: int = 3  # coefficients from a held end, where h begins to be lowered
+    lowered_to: int = 10  # and from where on it is lowered in full; on a fine grid, where these take no time to pass,
+    lowered_time: float = 0.15  # s, after as many as take this long
+
+
 class Tuning(NamedTuple):
     """The numbers by what they act on; a NamedTuple, as compiled functions read it."""
+
+    penalties: Penalties = Penalties()
+    guess: Guess = Guess()
 
     # Limits at points, problem.py
     margin: float = 1e-3  # fraction by which limits are tightened, for what happens between points

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
-from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.problem import Ends, Segment
+from cfplan.planners.expert.problem import Ends, Segment, Shape, layout_of
 from cfplan.planners.expert.tuning import TUNING, WindowSize
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.profile import BoundaryState

@@ -1,5 +1,7 @@
 """The problem behind the expert: derivatives, machine code, what is believed, and how limits are lowered."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
@@ -15,9 +17,8 @@ from cfplan.planners.expert.expert import FROM_GUESS, Attempt, plan_expert, solv
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import Violation
 from cfplan.planners.expert.kernel import Kernels
-from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.point_constraints import ROWS, Penalties
-from cfplan.planners.expert.problem import Ends, Segment, build_problem, tightened
+from cfplan.planners.expert.point_constraints import ROWS
+from cfplan.planners.expert.problem import Ends, Segment, Shape, build_problem, layout_of, tightened
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE, SplineProgram
 from cfplan.planners.expert.vector_code import generator
 from cfplan.planners.solution import Status
@@ -37,8 +38,8 @@ def segment_of(shape: Shape) -> Segment:
     return Segment(PATH, HARDWARE.airframe, HARDWARE.limits, Ends(None, None), yaw, layout_of(shape))
 
 
-def problem_of(shape: Shape, penalties: Penalties | None = None):
-    return build_problem(segment_of(shape), 0.2, penalties)
+def problem_of(shape: Shape):
+    return build_problem(segment_of(shape), 0.2)
 
 
 def near_the_guess(problem, size: float, seed: int = 5):
@@ -48,7 +49,7 @@ def near_the_guess(problem, size: float, seed: int = 5):
 
 
 def test_the_cost_is_the_time_of_flight():
-    problem = problem_of(Shape(60, False), Penalties(0.0, 0.0, 0.0))
+    problem = replace(problem_of(Shape(60, False)), penalties=np.zeros(3))
     program, v = near_the_guess(problem, 0.002)
     trajectory = Trajectory(PATH, segment_of(Shape(60, False)).profile(program.coefficients_of(v)), HARDWARE.airframe)
     assert program.evaluate(v).cost / OBJECTIVE_SCALE == pytest.approx(trajectory.duration, rel=1e-6)
