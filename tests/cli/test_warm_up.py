@@ -32,13 +32,14 @@ def run(code, cache, *arguments):
     """Return the names of what was compiled, and the process."""
     done = subprocess.run(
         [sys.executable, "-c", LISTENING + code, *arguments],
-        cwd=ROOT, env=os.environ | {"CFPLAN_CACHE": str(cache)}, capture_output=True, text=True, timeout=580,
+        cwd=ROOT, env=os.environ | {"CFPLAN_CACHE": str(cache)}, capture_output=True, text=True, timeout=900,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return [line.split()[1] for line in done.stderr.splitlines() if line.startswith("compiles ")], done
 
 
 @pytest.mark.slow  # it compiles all that a flight needs, for a minute or two
+@pytest.mark.timeout(1200)
 def test_after_compiling_ahead_nothing_is_compiled(tmp_path):
     _, done = run(COMMAND, tmp_path, "doctor", "--warm-up", "--json")
     assert "functions so far" not in done.stdout  # JSON alone is printed

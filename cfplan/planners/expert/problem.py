@@ -4,7 +4,6 @@ Its variables are coefficients of splines on the grid: a cubic one of x = h/unit
 of yaw (transcription.py). Numbers are in node units: s counted in intervals of the grid.
 """
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -183,9 +182,9 @@ def build_problem(
     if ends.joint is not None:
         margin[ends.joint - TUNING.around_joint : ends.joint + TUNING.around_joint] = TUNING.joint_margin
     s = layout.speed_s * step
-    speed = np.full(len(s), allowed_speed(limits.speed, segment.caps, s), dtype=float)
-    ceiling = TUNING.ceiling * segment.slowness**2
-    nominal, highest = _highest(path(s, 1), layout.speed_interval, margin, speed, unit, ceiling)
+    nominal = np.linalg.norm(path(s, 1), axis=1)
+    speed = (1.0 - margin[layout.speed_interval]) * allowed_speed(limits.speed, segment.caps, s)
+    highest = np.minimum((speed / np.maximum(nominal, REST)) ** 2 / unit, TUNING.ceiling * segment.slowness**2)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:
             highest[node] = np.inf  # the state decides, and was checked
@@ -203,19 +202,6 @@ def build_problem(
     )  # fmt: skip
 
 
-@njit(error_model="numpy")
-def _highest(
-    tangent: NDArray, interval: NDArray, margin: NDArray, speed: NDArray, unit: float, ceiling: float
-) -> tuple[NDArray, NDArray]:
-    """Return |γ'| where the speed limit holds, from γ', (K, 3), and x at most there by the speeds allowed, (K,)."""
-    nominal, highest = np.empty(len(tangent)), np.empty(len(tangent))
-    for n in range(len(tangent)):
-        nominal[n] = math.sqrt(tangent[n, 0] ** 2 + tangent[n, 1] ** 2 + tangent[n, 2] ** 2)
-        root = (1.0 - margin[interval[n]]) * speed[n] / max(nominal[n], REST)
-        highest[n] = min(root * root / unit, ceiling)
-    return nominal, highest
-
-
 def interval_of(segment: Segment, coefficients: NDArray) -> float:
     """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
     h = segment.unit * np.maximum(coefficients[:, 0], TUNING.floor)
@@ -224,54 +210,24 @@ def interval_of(segment: Segment, coefficients: NDArray) -> float:
 
 def _point_data(segment: Segment, step: float) -> NDArray:
     """Return the point data, (POINT_DATA, P), in node units."""
-    layout, yaw = segment.layout, segment.yaw
-    derivatives = segment.path.derivatives(layout.s * step)
-    data = np.empty((point_constraints.POINT_DATA, len(layout.interval)))
-    yaws = yaw.yaw, yaw.dyaw, yaw.ddyaw
-    _fill_point_data(data, derivatives, step, layout.interval, layout.place, layout.weight, *yaws)
-    return data
-
-
-@njit
-def _fill_point_data(
-    data: NDArray, derivatives: NDArray, step: float, interval: NDArray, place: NDArray, weight: NDArray, yaw: NDArray,
-    dyaw: NDArray, ddyaw: NDArray,
-) -> None:  # fmt: skip
-    for order in range(1, 5):
-        for axis in range(3):
-            for p in range(len(interval)):
-                data[3 * (order - 1) + axis, p] = derivatives[order, axis, p] * step**order
-    for p in range(len(interval)):
-        k = interval[p]
-        turned = yaw_within(place[p] * step, yaw[k], dyaw[k], ddyaw[k])
-        data[12, p], data[13, p] = place[p], weight[p]
-        data[14, p], data[15, p], data[16, p] = turned[0], turned[1] * step, turned[2] * step**2
+    layout, given, k = segment.layout, segment.yaw, segment.layout.interval
+    of_path = segment.path.derivatives(layout.s * step)[1:] * step ** np.arange(1.0, 5.0)[:, None, None]
+    yaw, dyaw, ddyaw = yaw_within(layout.place * step, given.yaw[k], given.dyaw[k], given.ddyaw[k])
+    return np.stack([*of_path.reshape(12, -1), layout.place, layout.weight, yaw, dyaw * step, ddyaw * step**2])
 
 
 def _limits_at_points(layout: Layout, ends: Ends, margin: NDArray) -> tuple[NDArray, NDArray]:
     """Return the lower and upper bounds of the rows at points, tightened by the margin of each interval, (N,)."""
-    last = layout.interval[-1] + 1.0 if ends.end else np.inf
-    return _tightened_by_margin(
-        layout.bounded, layout.interval, layout.place, margin, 0.0 if ends.start else -1.0, last,
-        point_constraints.LOWER, point_constraints.UPPER, point_constraints.JUMPS,
-    )  # fmt: skip
-
-
-@njit
-def _tightened_by_margin(
-    bounded: NDArray, interval: NDArray, place: NDArray, margin: NDArray, first: float, last: float, lower: NDArray,
-    upper: NDArray, jumps: NDArray,
-) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Return _limits_at_points; boundary states decide the points at `first` and `last`, in intervals."""
-    low, high = np.full(bounded.shape, -np.inf), np.full(bounded.shape, np.inf)
-    for row in range(len(bounded)):
-        for p in range(len(interval)):
-            if bounded[row, p]:
-                s = interval[p] + place[p]
-                decided = s in (first, last) and not jumps[row]
-                tighter = -TUNING.boundary_tolerance if decided else 2.0 * margin[interval[p]]  # most are squares
-                low[row, p], high[row, p] = lower[row] + tighter, upper[row] - tighter
-    return low, high
+    decided = (layout.s == 0.0) & ends.held[0] | (layout.s == layout.shape.nodes) & ends.held[1]  # by boundary states
+    tighter = np.where(
+        decided & ~point_constraints.JUMPS[:, None],
+        -TUNING.boundary_tolerance,
+        2.0 * margin[layout.interval],  # as most rows are squares
+    )
+    return (
+        np.where(layout.bounded, point_constraints.LOWER[:, None] + tighter, -np.inf),
+        np.where(layout.bounded, point_constraints.UPPER[:, None] - tighter, np.inf),
+    )
 
 
 def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
@@ -285,20 +241,13 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
         problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper,
         under, over,
     )  # fmt: skip
-    highest = _slowed_between(problem.highest, over[:, SPEED], layout.speed_interval)
+    slower = np.maximum(over[:, SPEED], 0.0)  # in each interval; at nodes, of either side's
+    at_nodes, between = (
+        np.maximum(np.append(slower, 0.0), np.append(0.0, slower)),
+        layout.speed_interval[len(slower) + 1 :],
+    )
+    highest = problem.highest * (1.0 - np.append(at_nodes, slower[between]))
     return replace(problem, lower=lower, upper=upper, highest=highest)
-
-
-@njit
-def _slowed_between(highest: NDArray, over: NDArray, interval: NDArray) -> NDArray:
-    """Return `highest` lowered by `over`, (N,), of the intervals; at the nodes, which come first, of either side's."""
-    lowered, count = np.empty(len(highest)), len(over)
-    for p in range(len(highest)):
-        slower = 1.0 - max(over[interval[p]], 0.0)
-        if p <= count:
-            slower = min(1.0 - max(over[p], 0.0) if p < count else 1.0, 1.0 - max(over[p - 1], 0.0) if p > 0 else 1.0)
-        lowered[p] = highest[p] * slower
-    return lowered
 
 
 @njit

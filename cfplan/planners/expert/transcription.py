@@ -144,18 +144,26 @@ class SplineProgram:
         self.bounds = self._bounds(problem)
 
     def _bounds(self, problem: Problem) -> NDArray:
-        it = self._variables
-        least, most = (-np.inf, np.inf) if problem.ends.start else map(float, problem.first_yaw)
-        lower, upper = _limits(problem.lower, problem.upper, problem.highest, self._linear, it.positive, (least, most))
+        """Return the bounds of all constraints, with those of the linear ones behind those at points."""
+        positive, of_yaw = self._variables.positive, self._variables.sparsity.of_yaw
+        yaw = [(-np.inf, np.inf) if problem.ends.start else problem.first_yaw] * of_yaw
+        least, most = np.reshape(yaw, (of_yaw, 2)).T
+        open_below, floor = np.full(len(problem.highest), -np.inf), np.full(positive, TUNING.floor)
+        lower = np.concatenate([problem.lower.ravel(), open_below, floor, least])
+        upper = np.concatenate([problem.upper.ravel(), problem.highest, np.full(positive, np.inf), most])
         return bounds_of(lower, upper)
 
     def v_of(self, coefficients: NDArray) -> NDArray:
         """Return the variables of a table; the smallest counts where several have one value."""
-        return _smallest(coefficients, self._variables.slots, self._variables.size)
+        slots = self._variables.slots
+        v = np.full(self._variables.size, np.inf)
+        np.minimum.at(v, slots[slots >= 0], coefficients[slots >= 0])
+        return np.where(np.isfinite(v), v, 0.0)
 
     def coefficients_of(self, v: NDArray) -> NDArray:
         """Return the table, (N+3, 1 or 2)."""
-        return _table(v, self._variables.slots, self._fixed)
+        slots = self._variables.slots
+        return np.where(slots >= 0, v[slots], self._fixed)
 
     def rows_of(self, constraints: NDArray) -> NDArray:
         """Return the (ROWS, P) rows at points of constraints, (m,)."""
@@ -180,49 +188,6 @@ class SplineProgram:
         """Give the kernels the coefficients at v."""
         it = self._variables.sparsity
         _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
-
-
-@njit
-def _limits(lower, upper, highest, linear, positive, yaw):
-    """Return the least and most of all constraints, (m,) each, with those of the linear ones behind those at points."""
-    points, behind = lower.size, lower.size + len(highest)
-    low, high = np.full(points + linear, -np.inf), np.full(points + linear, np.inf)
-    count = lower.shape[1]
-    for row in range(lower.shape[0]):
-        for p in range(count):
-            low[row * count + p], high[row * count + p] = lower[row, p], upper[row, p]
-    for j in range(len(highest)):
-        high[points + j] = highest[j]
-    for j in range(positive):
-        low[behind + j] = TUNING.floor
-    if behind + positive < len(low):  # the last is where yaw starts
-        low[-1], high[-1] = yaw
-    return low, high
-
-
-@njit
-def _table(v, slots, fixed):
-    """Return the table of coefficients, of which those without an entry of v are `fixed`."""
-    table = fixed.copy()
-    for n in range(table.shape[0]):
-        for column in range(table.shape[1]):
-            if slots[n, column] >= 0:
-                table[n, column] = v[slots[n, column]]
-    return table
-
-
-@njit
-def _smallest(table, slots, size):
-    v = np.full(size, np.inf)
-    for n in range(table.shape[0]):
-        for column in range(table.shape[1]):
-            at = slots[n, column]
-            if at >= 0:
-                v[at] = min(v[at], table[n, column])
-    for k in range(size):
-        if not np.isfinite(v[k]):
-            v[k] = 0.0
-    return v
 
 
 @register_jitable
