@@ -211,7 +211,8 @@ def interval_of(segment: Segment, coefficients: NDArray) -> float:
 def _point_data(segment: Segment, step: float) -> NDArray:
     """Return the point data, (POINT_DATA, P), in node units."""
     layout, given, k = segment.layout, segment.yaw, segment.layout.interval
-    of_path = segment.path.derivatives(layout.s * step)[1:] * step ** np.arange(1.0, 5.0)[:, None, None]
+    powers = np.array([step, step**2, step**3, step**2 * step**2])
+    of_path = segment.path.derivatives(layout.s * step)[1:] * powers[:, None, None]
     yaw, dyaw, ddyaw = yaw_within(layout.place * step, given.yaw[k], given.dyaw[k], given.ddyaw[k])
     return np.stack([*of_path.reshape(12, -1), layout.place, layout.weight, yaw, dyaw * step, ddyaw * step**2])
 
