@@ -29,6 +29,7 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.glitches import glitch_at_sampled_setpoints
 from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_stops
+from cfplan.simulation.virtual_crazyflie.log_variables import log_variables
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 
 NODES = 12  # grid intervals; so few that something exceeds limits between them
@@ -70,10 +71,15 @@ def _prepare(path_file: Path, limits: Limits) -> None:
 
 
 def _simulate(_path_file: Path, limits: Limits) -> None:
-    """Let the virtual vehicle stand on the floor."""
+    """Let the virtual vehicle stand on the floor, and read all that it can log."""
     vehicle = VirtualCrazyflie(limits.airframe)
     for _ in range(3):
         vehicle.advance(10)
+    for value in log_variables(
+        vehicle.stabilizer.loop, localization=vehicle.localization, supervisor=vehicle.supervisor,
+        battery=vehicle.battery, setpoint=lambda: vehicle.setpoint, info=lambda: 0,
+    ).values():  # fmt: skip
+        value()
 
 
 PARTS: Mapping[str, Callable[[Path, Limits], None]] = MappingProxyType(

@@ -95,9 +95,9 @@ def stop_motion(
     elapsed *= duration * rate  # in setpoints
     yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
     position, velocity, sent, attitude, body_rate, acceleration = _stop_rows(
-        np.array(motion.position, dtype=float),
-        np.array(motion.velocity, dtype=float),
-        np.array(motion.acceleration, dtype=float),
+        np.array(motion.position, dtype=float, order="C"),  # one type for the compiler
+        np.array(motion.velocity, dtype=float, order="C"),
+        np.array(motion.acceleration, dtype=float, order="C"),
         np.array(yaw, dtype=float),
         np.array(begin, dtype=np.int64),
         np.stack([elapsed, clock_rate, slowing]),
