@@ -1,4 +1,4 @@
-"""Compiled functions are kept where no stale code can come from, and by two processes at once."""
+"""Compiled functions are kept where no stale code can come from, and by several processes at once."""
 
 import gc
 import os
@@ -8,8 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
+from numba.core.errors import NumbaError
 
 from cfplan import machine_code
 from cfplan.machine_code import njit
@@ -32,7 +32,8 @@ def doubling():
 
 
 def files(cache):
-    return sorted(file.name for file in cache.iterdir() if file.suffix == ".numba")
+    """The code of each function and set of argument types."""
+    return sorted(file.name for file in cache.rglob("*.nbc"))
 
 
 def test_a_function_is_compiled_once_for_each_kind_of_argument(cache):
@@ -102,50 +103,68 @@ def test_what_other_processes_kept_is_used_and_called_by_what_is_compiled_later(
 def test_where_nothing_can_be_written_functions_are_compiled_all_the_same(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path / "file" / "below"))
-    assert not machine_code.kept()
+    assert not machine_code.cache_writable()
     assert doubling()(2) == 4
 
 
-def test_a_damaged_file_is_compiled_anew(cache):
+@pytest.mark.parametrize("suffix", ["nbc", "nbi"])
+def test_a_damaged_file_is_compiled_anew(cache, suffix):
     doubling()(2)
-    (name,) = files(cache)
-    (cache / name).write_bytes(b"half a file")
+    names = files(cache)
+    (damaged,) = cache.rglob(f"*.{suffix}")
+    damaged.write_bytes(damaged.read_bytes()[:40])
     assert doubling()(2) == 4
-    assert doubling()(3) == 6
-    assert files(cache) == [name]
+    again = doubling()
+    assert again(3) == 6
+    assert sum(again.stats.cache_hits.values()) == 1
+    assert files(cache) == names
 
 
-KEYS = "from cfplan.machine_code import *; print(*(key(f'cfplan.{n}') for n in ('upper', 'lower', 'lowest', 'other')))"
+KEY = "from cfplan.machine_code import KEY; print(KEY)"
 
 
-def test_a_change_in_an_imported_module_changes_the_key(tmp_path):
+def test_a_change_in_any_source_that_compiled_code_may_depend_on_changes_the_key(tmp_path):
     copy = tmp_path / "cfplan"
-    copy.mkdir()
+    for name, text in {"__init__": "", "vehicle/mass": "G = 9.81\n", "cli/plan": "TITLE = 1\n"}.items():
+        file = copy / f"{name}.py"
+        file.parent.mkdir(exist_ok=True, parents=True)
+        file.write_text(text)
     shutil.copy(machine_code.__file__, copy)
-    for name, text in {
-        "__init__": "",
-        "upper": "from cfplan.lower import (\n    G,\n    H,\n)\n",
-        "lower": "from cfplan.lowest import G\n",
-        "lowest": "G = 9.81\n",
-        "other": "G = 9.81\n",
-    }.items():
-        (copy / f"{name}.py").write_text(text)
 
-    def keys():
+    def key():
         return subprocess.run(
-            [sys.executable, "-c", KEYS], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+            [sys.executable, "-c", KEY], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(tmp_path)},
             capture_output=True, text=True, check=True, timeout=100,
-        ).stdout.split()  # fmt: skip
+        ).stdout  # fmt: skip
 
-    before = keys()
-    (copy / "lowest.py").write_text("G = 9.80665\n")
-    assert [old != new for old, new in zip(before, keys(), strict=True)] == [True, True, True, False]
+    before = key()
+    (copy / "cli" / "plan.py").write_text("TITLE = 2\n")
+    assert key() == before
+    (copy / "vehicle" / "mass.py").write_text("G = 9.80665\n")
+    changed = key()
+    assert changed != before
+    (copy / "vehicle" / "mass.py").rename(copy / "vehicle" / "weight.py")
+    assert key() not in (before, changed)
 
 
-def start(folder, code):
+def test_no_compiled_function_depends_on_what_the_key_leaves_out():
+    for file in PACKAGE.rglob("*.py"):
+        room, text = file.relative_to(PACKAGE).parts[0], file.read_text()
+        if "import njit" in text:
+            assert room not in machine_code.LEAVES, file
+            assert not re.search(rf"cfplan\.({'|'.join(machine_code.LEAVES)})\b", text), file
+
+
+def test_code_is_not_kept_once_a_source_has_changed_under_the_process(cache, monkeypatch):
+    monkeypatch.setattr(machine_code, "hash_of_sources", lambda: "another")
+    assert doubling()(2) == 4
+    assert files(cache) == []
+
+
+def start(folder, code, *arguments):
     """Start a process that can import from the folder, and goes on after a line on its standard input."""
     return subprocess.Popen(
-        [sys.executable, "-c", code], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-c", code, *arguments], cwd=folder, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         env=os.environ | {"PYTHONPATH": os.pathsep.join((str(PACKAGE.parent), str(folder)))},
     )  # fmt: skip
 
@@ -166,80 +185,44 @@ def test_code_of_a_module_that_was_edited_after_its_import_is_not_kept_for_the_n
     assert again.communicate("\n", timeout=100)[0] == "ready\n1000\n1\n"
 
 
-FAILING = """
-from cfplan.machine_code import njit
-from numba.core.errors import NumbaError
+def test_a_failure_to_compile_leaves_the_collector_on(cache):
+    @njit
+    def fails(x):
+        return x.nothing_of_this_name
 
-@njit
-def fails(x):
-    return x.nothing_of_this_name
-
-try:
-    fails(1.0)
-except NumbaError:
-    print("raised", flush=True)
-input()
-"""
-
-
-def test_a_process_that_fails_to_compile_lets_others_try(cache, tmp_path):
-    (tmp_path / "failing.py").write_text(FAILING)
-    first = start(tmp_path, "import failing")
-    assert first.stdout.readline() == "raised\n"
-    assert start(tmp_path, "import failing").communicate("\n", timeout=60)[0] == "raised\n"  # while the first is there
-    first.communicate("\n", timeout=60)
-
-
-def test_what_fails_to_be_made_leaves_the_collector_on_and_lets_others_make_it(cache, tmp_path):
-    def fail():
-        raise MemoryError
-
-    with pytest.raises(MemoryError):
-        machine_code.kept_or_made("something", "cfplan.errors", fail)
+    with pytest.raises(NumbaError):
+        fails(1.0)
     assert gc.isenabled()
     assert not machine_code.compiles()
-    code = "from cfplan.machine_code import *; print(kept_or_made('something', 'cfplan.errors', lambda: b'made'))"
-    assert start(tmp_path, code).communicate(timeout=60)[0] == "b'made'\n"
 
 
-SLOWLY = """
-import sys, time
-from cfplan import machine_code
-from numba.core import event
-
-class Slowly(event.Listener):
-    def on_start(self, event):
-        name = event.data["dispatcher"].__name__
-        print("compiling", name, flush=True)
-        if name == "matrix_of":
-            time.sleep(1.0)
-    def on_end(self, event): ...
-
-event.register("numba:compile", Slowly())
-from cfplan.vehicle.rotations import matrix_of
+# Compiles a function for one kind of argument each, when told to.
+AT_ONCE = """
+import sys
 import numpy as np
+from kept import squares, total
 print("ready", flush=True)
 sys.stdin.readline()
-print(matrix_of(np.array([0.0, 0.0, 0.0, 1.0])).tolist(), flush=True)
+kind = getattr(np, sys.argv[1])
+print(float(total(kind(5))), float(total(kind(3))), sum(total.stats.cache_hits.values()), flush=True)
 """
+KINDS = ("int8", "int16", "int32", "int64")
 
 
-def test_of_two_processes_one_compiles_and_the_other_waits(cache):
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-c", SLOWLY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=os.environ
-        )
-        for _ in range(3)
-    ]
-    for process in processes:
-        assert process.stdout.readline() == "ready\n"
-    for process in processes:
-        process.stdin.write("\n")
-        process.stdin.flush()
-    outputs = [process.communicate(timeout=120)[0].splitlines() for process in processes]
-    assert all(process.returncode == 0 for process in processes)
-    assert {lines[-1] for lines in outputs} == {str(np.eye(3).tolist())}
-    assert sum("compiling matrix_of" in lines for lines in outputs) == 1
+def test_of_processes_that_compile_at_once_each_keeps_its_own(cache, tmp_path):
+    (tmp_path / "kept.py").write_text(KEPT_BEFORE)
+
+    def answers():
+        processes = [start(tmp_path, AT_ONCE, kind) for kind in KINDS]
+        for process in processes:
+            assert process.stdout.readline() == "ready\n"
+        for process in processes:
+            process.stdin.write("\n")
+            process.stdin.flush()
+        return [process.communicate(timeout=120)[0] for process in processes]
+
+    assert answers() == ["31.0 6.0 0\n"] * len(KINDS)
+    assert answers() == ["31.0 6.0 1\n"] * len(KINDS)
 
 
 def test_no_module_takes_njit_past_the_cache():

@@ -34,8 +34,9 @@ print(json.dumps({
 
 
 def seen(setting, cache):
+    (script := cache / "seen.py").write_text(SEEN)
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "tests.processors", setting, sys.executable, "-W", "error", "-c", SEEN],
+        [sys.executable, "-W", "error", "-m", "tests.processors", setting, sys.executable, "-W", "error", str(script)],
         cwd=ROOT, env=unset(dict(os.environ)) | {"CFPLAN_CACHE": str(cache), "PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False, timeout=100,
     )  # fmt: skip

@@ -9,7 +9,6 @@ from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import CfplanError
 from cfplan.numbers import shown
-from cfplan.preparation.compiled_calls import Stage
 
 TITLES = ["path", "planner", "flight", "against the fastest", "planning", "worst usage", "refused"]
 
@@ -30,7 +29,7 @@ def bench(path_files: tuple[Path, ...], safety_file: Path | None, planners: tupl
     Each planner plans a path twice; only the second run is timed, as the first one loads machine code.
     """
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_files[0], steps, compile_to=Stage.PLAN)
+    limits = options.read_limits(safety_file, path_files[0], steps)
     with steps.waiting("loading planners"):
         from cfplan.geometry.path_file import load_path_file
         from cfplan.planning.path.choice import chosen_path

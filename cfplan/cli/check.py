@@ -9,7 +9,6 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import ExitCode
-from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(
@@ -31,7 +30,7 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     steps = Steps(as_json=as_json)
     if path_or_plan.is_dir():
         return _check_record(path_or_plan, steps)
-    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
+    limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation.plan_flight import plan_flight

@@ -1,7 +1,6 @@
 """`cfplan doctor`: check that everything that a flight needs is installed."""
 
 import logging
-import os
 import platform
 import sys
 from contextlib import ExitStack
@@ -11,7 +10,7 @@ from pathlib import Path
 import click
 
 from cfplan.cli import options
-from cfplan.cli.output import print_json, print_table
+from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import CfplanError
 from cfplan.files.nearest import nearest
 from cfplan.files.shipped import example_limits
@@ -29,7 +28,7 @@ OPTIONAL = {
 
 
 @click.command(short_help="Check versions, packages, machine code and radio.", epilog="Example: cfplan doctor --json")
-@click.option("--warm-up", "warm", is_flag=True, help="First compile everything that flights need, on all processors.")
+@click.option("--warm-up", "warm", is_flag=True, help="First compile everything that flights need, side by side.")
 @click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml.  [default: the nearest]")
 @click.option("--uri", help="Vehicle whose firmware and settings to check as preflight does; nothing is changed.")
 @options.as_json
@@ -38,7 +37,7 @@ def doctor(warm: bool, safety_file: Path | None, uri: str | None, as_json: bool)
     if warm:
         from cfplan.cli.warm_up import warm_up
 
-        warm_up(safety_file or nearest(options.SAFETY_FILE, Path.cwd()) or example_limits(), os.cpu_count() or 1)
+        warm_up(safety_file or nearest(options.SAFETY_FILE, Path.cwd()) or example_limits(), Steps(as_json=as_json))
     checks = [
         _python(),
         *map(_package, NEEDED),
@@ -90,13 +89,12 @@ def _optional(name: str) -> dict[str, str]:
 
 def _machine_code() -> dict[str, str]:
     """Check whether compiled functions can be cached for the next start."""
-    from cfplan.machine_code import cache_folder, kept
+    from cfplan.machine_code import cache_folder, cache_writable, code_folder, count_functions
 
-    if not kept():
+    if not cache_writable():
         hint = f"{cache_folder()} cannot be written: each command compiles anew; CFPLAN_CACHE names another folder"
         return _check("machine code", "-", "optional", hint)
-    functions = len(list(cache_folder().glob("*-*")))
-    return _check("machine code", f"{functions} functions in {cache_folder()}")
+    return _check("machine code", f"{count_functions()} functions in {code_folder()}")
 
 
 def _priority() -> dict[str, str]:

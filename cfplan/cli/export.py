@@ -8,7 +8,6 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
-from cfplan.preparation.compiled_calls import Stage
 
 _FORMS = ("crazyswarm", "memory", "compressed", "samples")
 
@@ -47,7 +46,7 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
     plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
     _check(form, output, force, pieces)
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.PLAN)
+    limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation import export_flight

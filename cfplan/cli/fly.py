@@ -9,7 +9,6 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table, styled
 from cfplan.errors import ExitCode, InputError
-from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -90,20 +89,18 @@ def fly(
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
         return _steer(path_or_plan, lines, on_board, safety_file, uri, mocap_uri, records, watched, yes, as_json)
-    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.FLIGHT)
+    limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-            from cfplan.cli.warm_up import compiling_paused
         prepare = _preparation(on_board)
         prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
-        with compiling_paused():
-            flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
+        flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, flown, as_json)
     return int(flown.outcome.exit_code)
 

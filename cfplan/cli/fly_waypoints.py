@@ -11,7 +11,6 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table, styled
 from cfplan.errors import CfplanError, ExitCode, FlightEndedError, InputError
-from cfplan.preparation.compiled_calls import Stage
 from cfplan.steering.starting_vehicle import SIMULATED
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def fly_waypoints(
     steps = Steps(as_json=as_json)
     if not yes and not uri.startswith(SIMULATED):
         raise InputError("hardware takes off at once", where=uri, hint="--yes, once the room is clear of people")
-    limits = options.read_limits(safety_file, Path.cwd(), steps, compile_to=Stage.FLIGHT)
+    limits = options.read_limits(safety_file, Path.cwd(), steps, compiled=True)
     with steps.waiting("loading planners and simulator"):
         from cfplan.steering.connect import connect
         from cfplan.steering.waypoint_lines import STANDARD_INPUT, opened_lines, refuse_rest, steer_by_lines

@@ -15,7 +15,6 @@ from cfplan.files.nearest import nearest
 
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
-    from cfplan.preparation.compiled_calls import Stage
     from cfplan.preparation.plan_flight import FlightOptions
     from cfplan.safety.limits import Limits
 
@@ -189,8 +188,8 @@ def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path
     return FlightOptions(**rest, **more, models=() if found is None else (found,))
 
 
-def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_to: "Stage | None" = None) -> "Limits":
-    """Find and read safety.yaml, as the first step of a command; begin to compile the functions that it will need.
+def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compiled: bool = False) -> "Limits":
+    """Find and read safety.yaml, as the first step of a command; `compiled` first compiles all that flights need.
 
     Raises InputError if safety.yaml is wrong, or there is no path file.
     """
@@ -198,16 +197,13 @@ def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compile_
         raise InputError("no such file", where=str(path_file), hint="check the name; it is relative to this folder")
     with steps.step("limits") as results:
         safety_file = find_safety_file(given, path_file)
-        compiling = ""
-        if compile_to is not None:
-            from cfplan.cli.warm_up import compile_ahead
-
-            compiling = compile_ahead(compile_to, safety_file, steps)
-
         from cfplan.safety.limits_file import load_limits
 
         limits = load_limits(safety_file)
         plan = limits.plan
         results.append(f"{limits.vehicle}, {plan.speed:g} m/s, {plan.acceleration:g} m/s² ({short_path(safety_file)})")
-        results += [compiling] if compiling else []
+    if compiled:
+        from cfplan.cli.warm_up import warm_up
+
+        warm_up(safety_file, steps)
     return limits

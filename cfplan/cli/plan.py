@@ -9,7 +9,6 @@ from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
 from cfplan.numbers import shown
-from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
     from cfplan.preparation.plan_flight import PlannedFlight
@@ -37,12 +36,12 @@ def plan(
     """Plan the fastest flight along PATH within every limit, and print its certificate."""
     _check_files(output, figure, force)
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.PLAN)
+    limits = options.read_limits(safety_file, path_file, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation.plan_flight import plan_flight
 
-    flight = options.flight_options(planning, safety_file, path_file, only_shown=output is None and figure is None)
+    flight = options.flight_options(planning, safety_file, path_file)
     planned = plan_flight(path_file, limits, flight, steps)
     bounds = _bounds(planned, steps)
     if output is not None:

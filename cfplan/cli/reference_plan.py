@@ -25,7 +25,6 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 
     Raises InputError if a file is wrong, InfeasibleError if no profile keeps the limits of motion.
     """
-    from cfplan.preparation.compiled_calls import Stage
     from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
     from cfplan.recording.overlay import reference_of
     from cfplan.recording.record import PLAN_FILE
@@ -38,7 +37,7 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
             trajectory = load_plan(file).trajectory
             results.append(f"{trajectory.duration:.2f} s, read from {file}")
         return reference_of(trajectory, file.stem if file is source else source.resolve().name)
-    limits = options.read_limits(safety_file, source, steps, compile_to=Stage.PLAN)
+    limits = options.read_limits(safety_file, source, steps)
     try:
         planned = plan_flight(source, limits, FlightOptions(), steps)
     except InfeasibleError as error:

@@ -9,7 +9,6 @@ import click
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.numbers import shown
-from cfplan.preparation.compiled_calls import Stage
 
 if TYPE_CHECKING:
     from cfplan.preparation.path_robustness import PathRobustness, ScaleSummary
@@ -43,13 +42,11 @@ def robustness(
     A perturbed path is smooth, at rest where the original is, and within --epsilon of it everywhere.
     """
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_file, steps, compile_to=Stage.REHEARSAL)
+    limits = options.read_limits(safety_file, path_file, steps)
     with steps.waiting("loading planners and simulator"):
         from cfplan.geometry.path_file import load_path_file
-        from cfplan.machine_code import compile_from_here
         from cfplan.preparation.path_robustness import path_robustness
 
-    compile_from_here()  # simulating without machine code takes minutes
     with steps.step("robustness") as results:
         chosen: dict[str, Any] = {"scales": scales} if scales else {}
         result = path_robustness(load_path_file(path_file), limits, **chosen, **given)

@@ -8,7 +8,6 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
-from cfplan.preparation.compiled_calls import Stage
 
 
 @click.command(short_help="Rehearse a flight in the dry run.", epilog="Example: cfplan sim flights/slalom.yaml")
@@ -18,7 +17,7 @@ from cfplan.preparation.compiled_calls import Stage
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
     """Rehearse a path or a plan file with its actual setpoints, the firmware's controller, drag and motor lag."""
     steps = Steps(as_json=as_json)
-    limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
+    limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners and simulator"):
         from cfplan.preparation.plan_flight import plan_flight
         from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse

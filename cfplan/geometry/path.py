@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numba.extending import register_jitable
@@ -185,34 +184,11 @@ def _located(breaks: NDArray, origins: NDArray, s: NDArray) -> tuple[NDArray, ND
     return piece, s - origins[piece]
 
 
-def derivatives_of(coefficients: NDArray, x: NDArray) -> NDArray:
-    """Return polynomials and their first four derivatives, (5, 3, N); coefficients are (N, D, 3), one at each x, (N,).
-
-    It does with numpy what compiled loops do point by point.
-    """
-    step: Any = horner_step  # whose arithmetic holds for arrays too
-    p = (np.zeros((3, len(x))),) * 5
-    for term in coefficients.transpose(1, 2, 0)[::-1]:
-        p = step(x, term, p)
-    return np.stack([factor * each for factor, each in zip((1.0, 1.0, 2.0, 6.0, 24.0), p, strict=True)])
-
-
 _GOLDEN = (math.sqrt(5) - 1) / 2
 _GOLDEN_STEPS = 45
 
 
-def _slowest_interpreted(breaks: NDArray, origins: NDArray, table: NDArray, low: NDArray, high: NDArray) -> NDArray:
-    def speed(s: NDArray) -> NDArray:
-        return np.asarray(np.linalg.norm(_values(breaks, origins, table, s), axis=-1))
-
-    for _ in range(_GOLDEN_STEPS):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-        rising = speed(left) < speed(right)
-        low, high = np.where(rising, low, left), np.where(rising, right, high)
-    return (low + high) / 2
-
-
-@njit(interpreted=_slowest_interpreted)
+@njit
 def _slowest_within(breaks: NDArray, origins: NDArray, table: NDArray, low: NDArray, high: NDArray) -> NDArray:
     """Return the s, (N,), of the least |γ'| between `low` and `high`; `table`, (M, D, 3), is that of γ'."""
     out = np.empty(len(low))
@@ -242,12 +218,7 @@ def _squared_speed(breaks: NDArray, origins: NDArray, table: NDArray, s: float) 
     return total
 
 
-def _trace_interpreted(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
-    piece, x = _located(breaks, origins, s)
-    out[:] = derivatives_of(coefficients[piece], x)
-
-
-@njit(interpreted=_trace_interpreted, fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _trace(breaks: NDArray, origins: NDArray, coefficients: NDArray, s: NDArray, out: NDArray) -> None:
     """Write γ and four derivatives at s into `out`, consecutive points of one piece together, up to _BATCH of them."""
     place, x = np.empty(len(s)), np.empty(_BATCH)
@@ -291,16 +262,7 @@ def _piece_at(breaks: NDArray, s: float) -> int:
     return piece
 
 
-def _values_interpreted(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) -> NDArray:
-    piece, x = _located(breaks, origins, places)
-    terms = table[piece]
-    out = terms[:, -1].copy()
-    for power in range(table.shape[1] - 2, -1, -1):
-        out = terms[:, power] + x[:, None] * out
-    return out
-
-
-@njit(interpreted=_values_interpreted)
+@njit
 def _values(breaks: NDArray, origins: NDArray, table: NDArray, places: NDArray) -> NDArray:
     """Return piecewise polynomials at each s, (N,), as (N, 3)."""
     out = np.empty((len(places), 3))

@@ -1,8 +1,7 @@
 """Evaluate the networks without torch: one thread, compiled loops over weights laid out for them.
 
-The input projections of a layer do not depend on the step before and are one matrix product, in a loop of our own:
-numpy would hand it to threads, which wait for one another where the processor's other cores are busy. The recurrence
-is a loop over the steps in which eight rows of the recurrent weights are added up at once.
+Matrix products are loops of our own: numpy would hand them to threads, which wait for one another where the processor's
+other cores are busy.
 """
 
 from collections.abc import Mapping
@@ -136,92 +135,30 @@ def _tanh(x: np.float32) -> np.float32:
 
 
 @njit(fastmath=True, error_model="numpy")
-def _add_recurrent(gates: NDArray, projected: NDArray, h: NDArray, weights: NDArray) -> None:
-    """Write projected + h @ weights to the gates, (4H,): eight rows of the weights, (H, 4H), at once."""
-    hidden = len(h)
-    for k in range(4 * hidden):
-        gates[k] = projected[k]
-    whole = hidden - hidden % 8
+def _add_product(sums: NDArray, values: NDArray, weights: NDArray) -> None:
+    """Add values, (I,), @ weights, (I, K), to the sums, (K,): eight rows of the weights at once."""
+    whole = len(values) - len(values) % 8
     for j in range(0, whole, 8):
-        h0, h1, h2, h3, h4, h5, h6, h7 = h[j], h[j + 1], h[j + 2], h[j + 3], h[j + 4], h[j + 5], h[j + 6], h[j + 7]
-        w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
-        w4, w5, w6, w7 = weights[j + 4], weights[j + 5], weights[j + 6], weights[j + 7]
-        for k in range(4 * hidden):
-            gates[k] += (h0 * w0[k] + h1 * w1[k] + h2 * w2[k] + h3 * w3[k]) + (
-                h4 * w4[k] + h5 * w5[k] + h6 * w6[k] + h7 * w7[k]
-            )
-    for j in range(whole, hidden):
-        for k in range(4 * hidden):
-            gates[k] += h[j] * weights[j, k]
+        for k in range(len(sums)):
+            total = sums[k]
+            for i in range(8):
+                total += values[j + i] * weights[j + i, k]
+            sums[k] = total
+    for j in range(whole, len(values)):
+        for k in range(len(sums)):
+            sums[k] += values[j] * weights[j, k]
 
 
-def _project_interpreted(out: NDArray, inputs: NDArray, weights: NDArray, bias: NDArray) -> None:
-    out[:] = inputs @ weights + bias
-
-
-@njit(interpreted=_project_interpreted, fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy")
 def _project(out: NDArray, inputs: NDArray, weights: NDArray, bias: NDArray) -> None:
-    """Write inputs, (R, I), @ weights, (I, K), + bias, (K,), to `out`: eight rows by four at once."""
-    rows, width, whole = len(inputs), len(bias), inputs.shape[1] - inputs.shape[1] % 4
-    sums = np.empty((8, width), np.float32)
-    s0, s1, s2, s3, s4, s5, s6, s7 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7]
-    for begin in range(0, rows, 8):
-        last = rows - 1  # again and again where there are no eight
-        a, b = inputs[begin], inputs[min(begin + 1, last)]
-        c, d = inputs[min(begin + 2, last)], inputs[min(begin + 3, last)]
-        e, f = inputs[min(begin + 4, last)], inputs[min(begin + 5, last)]
-        g, h = inputs[min(begin + 6, last)], inputs[min(begin + 7, last)]
-        for k in range(width):
-            s0[k] = s1[k] = s2[k] = s3[k] = s4[k] = s5[k] = s6[k] = s7[k] = bias[k]
-        for j in range(0, whole, 4):
-            w0, w1, w2, w3 = weights[j], weights[j + 1], weights[j + 2], weights[j + 3]
-            a0, a1, a2, a3 = a[j], a[j + 1], a[j + 2], a[j + 3]
-            b0, b1, b2, b3 = b[j], b[j + 1], b[j + 2], b[j + 3]
-            c0, c1, c2, c3 = c[j], c[j + 1], c[j + 2], c[j + 3]
-            d0, d1, d2, d3 = d[j], d[j + 1], d[j + 2], d[j + 3]
-            e0, e1, e2, e3 = e[j], e[j + 1], e[j + 2], e[j + 3]
-            f0, f1, f2, f3 = f[j], f[j + 1], f[j + 2], f[j + 3]
-            g0, g1, g2, g3 = g[j], g[j + 1], g[j + 2], g[j + 3]
-            h0, h1, h2, h3 = h[j], h[j + 1], h[j + 2], h[j + 3]
-            for k in range(width):
-                v0, v1, v2, v3 = w0[k], w1[k], w2[k], w3[k]
-                s0[k] += (a0 * v0 + a1 * v1) + (a2 * v2 + a3 * v3)
-                s1[k] += (b0 * v0 + b1 * v1) + (b2 * v2 + b3 * v3)
-                s2[k] += (c0 * v0 + c1 * v1) + (c2 * v2 + c3 * v3)
-                s3[k] += (d0 * v0 + d1 * v1) + (d2 * v2 + d3 * v3)
-                s4[k] += (e0 * v0 + e1 * v1) + (e2 * v2 + e3 * v3)
-                s5[k] += (f0 * v0 + f1 * v1) + (f2 * v2 + f3 * v3)
-                s6[k] += (g0 * v0 + g1 * v1) + (g2 * v2 + g3 * v3)
-                s7[k] += (h0 * v0 + h1 * v1) + (h2 * v2 + h3 * v3)
-        for j in range(whole, inputs.shape[1]):
-            for k in range(width):
-                v0 = weights[j, k]
-                s0[k] += a[j] * v0
-                s1[k] += b[j] * v0
-                s2[k] += c[j] * v0
-                s3[k] += d[j] * v0
-                s4[k] += e[j] * v0
-                s5[k] += f[j] * v0
-                s6[k] += g[j] * v0
-                s7[k] += h[j] * v0
-        for row in range(min(8, rows - begin)):
-            for k in range(width):
-                out[begin + row, k] = sums[row, k]
+    """Write inputs, (R, I), @ weights, (I, K), + bias, (K,), to `out`."""
+    for row in range(len(inputs)):
+        for k in range(len(bias)):
+            out[row, k] = bias[k]
+        _add_product(out[row], inputs[row], weights)
 
 
-def _run_interpreted(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
-    steps, hidden = out.shape[1], last.shape[2]
-    for direction, weights in enumerate(recurrent):
-        h, c, column = last[direction], cell[direction], direction * hidden
-        for t in range(steps) if direction == 0 else range(steps - 1, -1, -1):
-            gates = projected[:, t, 4 * column : 4 * (column + hidden)] + h @ weights
-            let_in, keep, _, let_out = (_HALF + _HALF * np.tanh(_HALF * gates)).reshape(-1, 4, hidden).swapaxes(0, 1)
-            c[:] = keep * c + let_in * np.tanh(gates[:, 2 * hidden : 3 * hidden])
-            h[:] = let_out * np.tanh(c)
-            out[:, t, column : column + hidden] = h
-
-
-@njit(interpreted=_run_interpreted, fastmath=True, error_model="numpy")
+@njit(fastmath=True, error_model="numpy")
 def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, cell: NDArray) -> None:
     """Run an LSTM layer over all steps; gates in torch's order: input, forget, cell, output."""
     batch, steps, hidden = out.shape[0], out.shape[1], last.shape[2]
@@ -233,7 +170,9 @@ def _run(out: NDArray, projected: NDArray, recurrent: NDArray, last: NDArray, ce
             h, c = last[direction, b], cell[direction, b]
             for n in range(steps):
                 t = n if direction == 0 else steps - 1 - n
-                _add_recurrent(gates, projected[b, t, 4 * column : 4 * (column + hidden)], h, weights)
+                for k in range(4 * hidden):
+                    gates[k] = projected[b, t, 4 * column + k]
+                _add_product(gates, h, weights)
                 for k in range(hidden):
                     let_in = _HALF + _HALF * _tanh(_HALF * gates[k])
                     keep = _HALF + _HALF * _tanh(_HALF * gates[hidden + k])

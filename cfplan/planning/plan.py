@@ -8,7 +8,6 @@ from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError, InputError
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
-from cfplan.machine_code import interprets
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO, MOST_NODES, find_planner
@@ -21,7 +20,6 @@ from cfplan.vehicle.profile import BoundaryState
 
 LEAST_SPEED_FACTOR = 0.01
 BUDGET, BUDGET_PER_METRE = 5.0, 0.02  # s, and s a metre
-INTERPRETED = 10.0  # times as long without machine code
 ANSWERING = 0.2  # of the time until the deadline, kept for making an answer of what was found
 REASONABLE_NODES = range(2, 10 * MOST_NODES + 1)
 
@@ -88,8 +86,8 @@ def plan(
 
 
 def default_budget(path: Path) -> float:
-    """Return how long planning a path may take, s, if nobody says so: ten times as long without machine code."""
-    return (BUDGET + BUDGET_PER_METRE * path.length) * (INTERPRETED if interprets() else 1.0)
+    """Return how long planning a path may take, s, unless another is given."""
+    return BUDGET + BUDGET_PER_METRE * path.length
 
 
 def _check_arguments(planner: str, nodes: int | None, speed_factor: float, bound: bool) -> None:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
 from cfplan.machine_code import njit
 from cfplan.numbers import shown
+from cfplan.planners.expert.expert import refinements
 from cfplan.planners.expert.intersample import violates_at_nodes
-from cfplan.planners.expert.refine import refinements
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.lowering import lower_locally
 from cfplan.safety.certificate import Certificate, certify

@@ -1,7 +1,6 @@
 """From a path file to a mission: planned, certified, encoded, rehearsed, with a way to stop from every setpoint."""
 
 __all__ = [
-    "compiled_calls",
     "export_flight",
     "from_programs",
     "link_loss_assessment",
@@ -9,5 +8,6 @@ __all__ = [
     "path_robustness",
     "plan_flight",
     "prepare_flight",
+    "small_flight",
     "steps",
 ]

@@ -20,7 +20,6 @@ from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
-from cfplan.machine_code import compile_from_here
 from cfplan.numbers import shown
 from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
@@ -117,7 +116,6 @@ def fit_polynomials(
         else:
             made = certified_pieces(trajectory, limits, leads=leads, most=most)
         results.append(_describe(made, planned))
-    compile_from_here()
     with step(on_step, "dry run") as results:
         run = on_board_run(made, limits.airframe, limits.flight)
         results.append(f"deviation {100 * run.deviation:.1f} cm at most, {100 * run.deviation_rms:.1f} cm rms")

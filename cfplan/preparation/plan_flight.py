@@ -11,7 +11,6 @@ from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import PathFile, load_path_file
-from cfplan.machine_code import compile_from_here, interprets
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planners.task import PlanningTask
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLAN_SUFFIX = ".parquet"
-LONG = 40.0  # m of path, from which on compiling takes less time than planning without
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +44,6 @@ class FlightOptions:
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
     budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
     models: tuple[Path, ...] = ()  # folders of models to look in first
-    only_shown: bool = False  # whether the plan will neither fly nor be kept, so that it need not wait for compiling
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,8 +148,6 @@ def plan_flight(
         check_space(path_file.path, limits.space, waypoints=path_file.waypoints, where=str(path_file.source))
         results.append(f"{path_file.name}, {path_file.path.length:.1f} m, {len(path_file.waypoints)} waypoints")
         results += path_file.losses
-    if path_file.path.length > LONG:
-        compile_from_here()
     with step(on_step, "plan") as results:
         planned = plan(
             path_file.path,
@@ -174,11 +169,6 @@ def plan_flight(
         if planned.left_out:
             results.warn(f"the budget of time is spent: {planned.left_out}")
         results.details += planned.notes
-    if options.only_shown and interprets():  # simulating link loss takes minutes without machine code
-        with step(on_step, "slowing") as results:
-            results.warn("not looked at before machine code is compiled; plan again, or with -o, to see it")
-        return PlannedFlight(path_file.name, planned, limits, path_file=path_file, fastest=fastest)
-    compile_from_here()  # without, simulating takes minutes
     planned, link_loss = give_way(planned, on_step, Deadline.after(left))
     return PlannedFlight(path_file.name, planned, limits, link_loss, path_file=path_file, fastest=fastest)
 
@@ -196,7 +186,6 @@ def give_way(
         InfeasibleError: at some place the vehicle would end so however slowly it flies there.
     """
     limits = planned.limits
-    compile_from_here()  # without, simulating takes minutes
 
     def assess(trajectory: Trajectory) -> list[Assessment]:
         encoded = encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space)

@@ -16,7 +16,6 @@ from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
-from cfplan.machine_code import compile_from_here
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_loss_of_stops
@@ -81,7 +80,6 @@ def prepare_mission(source: Path, limits: Limits, options: FlightOptions | None 
 
 def encode_flight(planned: PlannedFlight, on_step: OnStep = ignore_steps, *, stream_for: float = 0.0) -> EncodedFlight:
     """Encode a certified plan, and check the bytes against the trajectory. Raises NotCertifiedError."""
-    compile_from_here()  # without, rehearsing takes minutes
     plan = planned.plan
     with step(on_step, "certificate") as results:
         worst = plan.certificate.worst

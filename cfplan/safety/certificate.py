@@ -36,7 +36,6 @@ from cfplan.vehicle.trajectory import Trajectory
 TIME_STEP = 1e-3  # s, the most between two samples
 BATCH = 1_000  # samples at a time, about: as many as stay near the processor
 BLOCK = 512  # samples searched for a peak at once
-_INTERPRETED_BATCHES = 20  # as many times as many where samples are taken with numpy
 LEAST_POINTS = 11  # of a piece, its ends included
 WALLS, OBSTACLES = "distance to the walls", "distance to obstacles"
 OF_PLACE = (WALLS, OBSTACLES)  # decided by the path alone, at any speed
@@ -298,32 +297,6 @@ def _cut(
     return edges[:-1], edges[1:], interval, piece, counts
 
 
-def _search_interpreted(
-    table: NDArray, walls: NDArray, batch: int, source: dense.SampleSource, segments: Segments
-) -> tuple[NDArray, NDArray, NDArray]:
-    values, added, places = np.full(len(table), -np.inf), np.zeros(len(table)), np.zeros(len(table))
-    middle, half = walls.sum(axis=0) / 2, (walls[1] - walls[0]) / 2
-    for part in _parts(segments, _INTERPRETED_BATCHES * batch):
-        rows = dense.all_samples(source, part)
-        position = rows[dense.POSITION : dense.POSITION + walls.shape[1]]
-        position[:] = half[:, None] - abs(position - middle[:, None])
-        ends = np.cumsum(part.counts)
-        inner = np.ones(rows.shape[1], dtype=bool)
-        inner[ends - 1] = inner[ends - part.counts] = False
-        at = np.flatnonzero(inner)
-        for k, (first, count, sign) in enumerate(table):
-            before, here, after = (sign * rows[first : first + count, at + step] for step in (-1, 0, 1))
-            bounds = np.maximum(here, np.maximum(before, after))
-            bounds += _ALLOWANCE * np.maximum(2.0 * here - before - after, 0.0)
-            which, index = divmod(int(bounds.argmax()), len(at))
-            if not (np.isnan(values[k]) or bounds[which, index] <= values[k]):  # NaN is the worst and stays
-                values[k] = bounds[which, index]
-                near = [here[which, index], before[which, index], after[which, index]]
-                added[k] = values[k] - max(near)
-                places[k] = rows[dense.PLACE, at[index] + (0, -1, 1)[int(np.argmax(near))]]
-    return values, added, places
-
-
 def _parts(segments: Segments, samples: int) -> Iterator[Segments]:
     """Cut segments into parts of about so many samples."""
     group = (np.cumsum(segments.counts) - segments.counts) // samples
@@ -332,7 +305,7 @@ def _parts(segments: Segments, samples: int) -> Iterator[Segments]:
         yield Segments(*(values[begin:end] for values in segments))
 
 
-@njit(interpreted=_search_interpreted, error_model="numpy")
+@njit(error_model="numpy")
 def _search(
     table: NDArray, walls: NDArray, batch: int, source: dense.SampleSource, segments: Segments
 ) -> tuple[NDArray, NDArray, NDArray]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from cfplan.errors import InputError
 from cfplan.files.nearest import nearest
 from cfplan.flight.pilot.keys import Order
-from cfplan.machine_code import compile_from_here
 from cfplan.preparation.steps import OnStep, ignore_steps
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
@@ -54,7 +53,6 @@ def connect(
     if stepped and (not uri.startswith(SIMULATED) or mocap is not None):
         raise InputError("only the virtual vehicle flies on a stepped clock", where=uri, hint="leave out stepped")
     limits = _limits(safety)
-    compile_from_here()
     flight: FlightInProgress
     if stepped:
         flight = SteppedSteering(limits, more_orders=more_orders)

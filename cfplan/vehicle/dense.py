@@ -5,13 +5,13 @@ the other in one array: so the compiler knows that they do not overlap, and work
 instruction. How many places of the rows are in use is known at run time only, else it would write the loops out.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Derivatives, Path, derivatives_of, horner_step
+from cfplan.geometry.path import Derivatives, Path, horner_step
 from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.flatness import ROUNDING, Body, Flat, compiled_body, flat_state
@@ -131,24 +131,7 @@ def _whole_blocks(coefficients: NDArray) -> NDArray:
     return coefficients
 
 
-def _flat_interpreted(body: Body, curves: NDArray, node: NDArray, x: NDArray) -> Flat:
-    """Return the full state at N points at once; `curves`, (12, N), has the path's derivatives of order 1 to 4.
-
-    `node`, (7, N), is the profile where their intervals begin, `x`, (N,), how far from there they are.
-    """
-    derivatives: Any = tuple(tuple(curves[first : first + 3]) for first in range(0, 12, 3))
-    h: Any = h_within(x, node[0], node[1], node[2], node[3])
-    yaw: Any = yaw_within(x, node[4], node[5], node[6])
-    return flat_state(body, derivatives, h, yaw, np.cos, np.sin)
-
-
-def _at_points_interpreted(
-    out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
-) -> None:
-    out[:] = measures(_flat_interpreted(body, derivatives, nodes[interval, 1:].T, places))
-
-
-@njit(interpreted=_at_points_interpreted, error_model="numpy", fastmath=ROUNDING)
+@njit(error_model="numpy", fastmath=ROUNDING)
 def _at_points(
     out: NDArray, body: Body, derivatives: NDArray, nodes: NDArray, places: NDArray, interval: NDArray
 ) -> None:
@@ -269,19 +252,6 @@ def sample(
                 out[POSITION + row, done + n] = panel[row * WIDTH + n]
         for n in range(count):
             out[PLACE, done + n] = s[n]
-
-
-def all_samples(source: SampleSource, segments: Segments) -> NDArray:
-    """Return what sample() fills in, (SAMPLED_ROWS, samples), of all segments one behind the other, with numpy."""
-    counts = segments.counts
-    segment = np.repeat(np.arange(len(counts)), counts)
-    number, last = np.arange(len(segment)) - (np.cumsum(counts) - counts)[segment], (counts - 1)[segment]
-    left, right, piece = segments.left[segment], segments.right[segment], segments.piece[segment]
-    s = np.where(number < last, left + number / last * (right - left), np.nextafter(right, -np.inf))
-    curves = derivatives_of(source.coefficients[piece], s - source.origins[piece])
-    node = source.nodes[segments.interval[segment]].T
-    flat = _flat_interpreted(source.body, curves[1:].reshape(12, -1), node[1:], s - node[0])
-    return np.stack([*measures(flat), *curves[0], s])
 
 
 @register_jitable(fastmath=ROUNDING)

@@ -162,32 +162,7 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
     return sound, least, jumps, allowed
 
 
-def _split_interpreted(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-    interval, left, right = np.arange(len(nodes) - 1), nodes[:-1, 0], nodes[1:, 0]
-    parts = []
-    for _ in range(_SPLITS):
-        node, middle = nodes[interval].T, (left + right) / 2.0
-        duration, polynomial = _quadrature(node, left, right), np.empty((8, len(interval)))
-        off = abs(duration - _quadrature(node, left, middle) - _quadrature(node, middle, right))
-        _invert(polynomial, node, left, right, duration)
-        good = off < TOLERANCE + 1e-14 * duration
-        for share in _PROBES:
-            place = left + _horner(polynomial, share)
-            late = abs(_quadrature(node, left, place) - duration * share) * np.maximum(1.0, np.sqrt(_h(node, place)))
-            good &= late < 1e-10
-        parts.append((left[good], duration[good], interval[good], polynomial.T[good]))
-        left, middle, right = left[~good], middle[~good], right[~good]
-        if not len(left):
-            starts, durations, intervals, polynomials = (np.concatenate(each) for each in zip(*parts, strict=True))
-            order = np.argsort(starts)
-            return starts[order], durations[order], intervals[order], polynomials[order], np.nan
-        interval = np.repeat(interval[~good], 2)
-        left, right = np.stack([left, middle], axis=1).ravel(), np.stack([middle, right], axis=1).ravel()
-    nothing = np.empty(0)
-    return nothing, nothing, nothing.astype(int), np.empty((0, 8)), float(left.min())
-
-
-@njit(interpreted=_split_interpreted, error_model="numpy")
+@njit(error_model="numpy")
 def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
     """Return start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
     room = 2 * len(nodes) + 100

@@ -11,9 +11,8 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.planners.baselines.convex import plan_convex
 from cfplan.planners.baselines.min_snap import plan_min_snap
 from cfplan.planners.baselines.toppquad import plan_toppquad
-from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import refine
-from cfplan.planners.expert.windows import WindowSize
+from cfplan.planners.expert.expert import plan_expert, refine
+from cfplan.planners.expert.tuning import WindowSize
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import CAPPED_SPEED, certify

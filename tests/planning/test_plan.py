@@ -11,8 +11,8 @@ import pytest
 from cfplan.errors import CfplanError, InfeasibleError, InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.refine import refinements
-from cfplan.planners.expert.windows import WindowSize
+from cfplan.planners.expert.expert import refinements
+from cfplan.planners.expert.tuning import WindowSize
 from cfplan.planners.solution import Solution, Status
 from cfplan.planning import repair
 from cfplan.planning.plan import plan

@@ -7,8 +7,7 @@ import pytest
 from hard_paths import hard_paths
 
 from cfplan.learning.learned import plan_learned
-from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import refinements
+from cfplan.planners.expert.expert import plan_expert, refinements
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning import repair as repairing

@@ -21,7 +21,6 @@ from cfplan.flight.setpoints.encoding import (
     RATE_LEAD,
     THRUST_LEAD,
     command_quaternion,
-    controller_attitude,
     encode_motion,
 )
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
@@ -29,7 +28,7 @@ from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ah
 from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import about_z, norms, quaternions_of, write_quaternion, yaw_of
+from cfplan.vehicle.rotations import write_quaternion, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -96,9 +95,9 @@ def stop_motion(
     elapsed *= duration * rate  # in setpoints
     yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
     position, velocity, sent, attitude, body_rate, acceleration = _stop_rows(
-        np.array(motion.position, dtype=float),
-        np.array(motion.velocity, dtype=float),
-        np.array(motion.acceleration, dtype=float),
+        np.array(motion.position, dtype=float, order="C"),  # one type for the compiler
+        np.array(motion.velocity, dtype=float, order="C"),
+        np.array(motion.acceleration, dtype=float, order="C"),
         np.array(yaw, dtype=float),
         np.array(begin, dtype=np.int64),
         np.stack([elapsed, clock_rate, slowing]),
@@ -118,41 +117,7 @@ def stop_motion(
 _Rows = tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]
 
 
-def _stop_rows_interpreted(
-    position: NDArray,
-    velocity: NDArray,
-    acceleration: NDArray,
-    yaw: NDArray,
-    begin: NDArray,
-    clock: NDArray,
-    rate: float,
-    leads: NDArray,
-) -> _Rows:
-    """Return what _stop_rows gives, by numpy."""
-    count, (elapsed, clock_rate, slowing) = len(position), clock
-    place = np.minimum(begin[:, None] + elapsed, count - 1.0)
-    row = np.minimum(place.astype(int), max(count - 2, 0))
-    between = (place - row)[..., None]
-
-    def at(values: NDArray) -> NDArray:
-        after = values[np.minimum(row + 1, len(values) - 1)]
-        return values[row] + between * (after - values[row])
-
-    speed = at(velocity)
-    made = clock_rate[:, None] ** 2 * at(acceleration) + slowing[:, None] * speed
-    turn = at(yaw[:, None])[..., 0].reshape(-1)
-    attitude = quaternions_of(controller_attitude(made.reshape(-1, 3) + _GRAVITY, about_z(turn)))
-    attitude = attitude.reshape(*place.shape, 4)
-    turning = _turn_rates(attitude, rate)
-    body_rate = LEADING_SHARE * _ahead(turning, leads[0]) + (1.0 - LEADING_SHARE) * _ahead(turning, -leads[0])
-    body_rate[:, -1] = 0.0  # the vehicle may be left with the last setpoint
-    force = made + _GRAVITY
-    thrust = norms(force)[..., None]
-    sent = _ahead(thrust, leads[1]) / thrust * force - _GRAVITY
-    return at(position), clock_rate[:, None] * speed, sent, attitude, body_rate, made
-
-
-@njit(interpreted=_stop_rows_interpreted, error_model="numpy", nogil=True)
+@njit(error_model="numpy", nogil=True)
 def _stop_rows(
     position: NDArray,
     velocity: NDArray,
@@ -252,17 +217,3 @@ def _ahead(values: NDArray, by: float) -> NDArray:
     row = place.astype(int)
     after = np.minimum(row + 1, values.shape[-2] - 1)
     return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])
-
-
-def _turn_rates(quaternion: NDArray, rate: float) -> NDArray:
-    """Return (..., M, 3) rad/s in body axes: the turn from the attitude before to the one after."""
-    before = np.concatenate([quaternion[..., :1, :], quaternion[..., :-1, :]], axis=-2)
-    after = np.concatenate([quaternion[..., 1:, :], quaternion[..., -1:, :]], axis=-2)
-    periods = np.full(quaternion.shape[-2], 2.0)
-    periods[[0, -1]] = 1.0
-    v0, w0, v1, w1 = before[..., :3], before[..., 3:], after[..., :3], after[..., 3:]
-    vector = w0 * v1 - w1 * v0 - np.cross(v0, v1)
-    scalar = w0 * w1 + np.sum(v0 * v1, axis=-1, keepdims=True)
-    sine = norms(vector)[..., None]
-    angle = 2.0 * np.arctan2(sine, np.abs(scalar)) * np.sign(np.where(scalar == 0.0, 1.0, scalar))
-    return vector / np.maximum(sine, 1e-12) * angle * rate / periods[:, None]

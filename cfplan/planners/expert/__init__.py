@@ -1,3 +1,3 @@
 """The expert planner: the fastest profile that keeps every limit, and refining from a near-feasible one."""
 
-__all__ = ["expert", "intersample", "refine", "search", "sensitivity", "windows"]
+__all__ = ["expert", "intersample", "sensitivity", "windows"]

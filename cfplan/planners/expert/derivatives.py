@@ -20,7 +20,6 @@ from cfplan.planners.expert.point_constraints import (
     ROWS,
     WEIGHT,
     YAW,
-    family,
     variables,
 )
 from cfplan.planners.solver.barrier import TERMS
@@ -86,7 +85,7 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
 
     def function(title: str, arguments: list[casadi.SX], results: list[casadi.SX]) -> casadi.Function:
         dense = [casadi.densify(result) for result in results]
-        return casadi.Function(f"{family(free_yaw)}_{title}", arguments, casadi.cse(dense))
+        return casadi.Function(title, arguments, casadi.cse(dense))
 
     return (
         function("values", inputs, [rows, penalty]),

@@ -3,11 +3,15 @@
 h is a cubic B-spline on the grid, yaw a quadratic one, and their coefficients are the variables, so everything physical
 follows point by point through the flatness map (vehicle/flatness.py). Minimised is the time of flight, by Gauss
 quadrature, with small penalties on angular acceleration, yaw rate and roughness. Limits hold at both ends of every
-interval, where h''' and ψ'' jump, and at points inside.
+interval, where h''' and ψ'' jump, and at points inside (problem.py). Three strategies search for the solution:
 
-Between those points a limit can still be exceeded by a percent or so. The solution is checked densely; where it
-exceeds a limit, that limit is lowered by as much in that interval alone, and the problem solved again from there,
-which takes a few iterations and costs about a hundredth of a percent in time.
+    OPTIMUM      from a guess to the optimum
+    early()      from a guess to within about 0.02 % of it, in half the time; gives up early where there is no solution
+    refining()   as near, from a profile that nearly keeps its limits, in a fraction of the steps
+
+Between the points a limit can still be exceeded by a percent or so. The solution is checked densely; where it exceeds
+a limit, that limit is lowered by as much in that interval alone, and the problem solved again from there, which takes
+a few iterations and costs about a hundredth of a percent in time. Long paths are planned in windows (windows.py).
 
 Where the path rests (γ' = γ'' = γ''' = 0) h has no bearing on motion and hardly any on its first derivatives: left
 alone, an optimiser lets it run away or stop short. There h stays constant over the first, or last, interval.
@@ -15,89 +19,119 @@ alone, an optimiser lets it run away or stop short. There h stays constant over 
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.initial_guess import guess_spline
-from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import Ends, Problem, Segment, build_problem, interval_of, slowness_of
-from cfplan.planners.expert.search import (
-    COLD_START,
-    WARM_START,
-    Start,
-    early_start,
-    refining_restarts,
-    rejection_reason,
-    solve,
+from cfplan.planners.expert.initial_guess import guess_spline, led_into, lowered
+from cfplan.planners.expert.intersample import DensePath
+from cfplan.planners.expert.problem import (
+    Ends,
+    Problem,
+    Segment,
+    Shape,
+    build_problem,
+    held_by,
+    interval_of,
+    layout_of,
+    slowness_of,
+    tightened,
 )
-from cfplan.planners.expert.tightening import ENOUGH, Tightened, tighten_until_feasible
-from cfplan.planners.expert.windows import LONG_WINDOW, WindowSize, by_windows, failed_status, solution_of
-from cfplan.planners.solution import Solution
+from cfplan.planners.expert.transcription import SplineProgram
+from cfplan.planners.expert.tuning import TUNING, WindowSize
+from cfplan.planners.expert.windows import Joined, Tightened, by_windows, windows_of
+from cfplan.planners.solution import Solution, Status
+from cfplan.planners.solver.interior_point import Multipliers, Search, minimise
 from cfplan.planners.task import PlanningTask
-from cfplan.vehicle.yaw_spline import YawSpline
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.profile_spline import h_coefficients
+from cfplan.vehicle.yaw_spline import YawSpline, end_coefficients
 
-WINDOW = WindowSize(kept=96, ahead=24)  # longer windows take more iterations
-BEGINNING, LEAST_BEGINNING = 0.6, 12  # s, and intervals, within which a start in motion shows whether it leads on
 
-
-def plan_expert(
-    task: PlanningTask,
-    *,
-    penalties: Penalties | None = None,
-    window: WindowSize = WINDOW,
-    starts: Sequence[Start] = COLD_START,
-) -> Solution:
+def plan_expert(task: PlanningTask, *, window: WindowSize = TUNING.window) -> Solution:
     """Plan the fastest profile that keeps every limit of the task.
 
     Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
     both are laid out before the speed (see YawSpline), which then respects what turning takes. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
-    brings its own yaw in every mode. A path longer than `window` is planned window by window, and as a whole if one of
-    them fails. The search begins as the first of `starts` that succeeds. At the task's deadline there is no profile,
-    unless only limits between points were still exceeded.
+    brings its own yaw in every mode. A path longer than `window` is planned window by window, and in one piece if one
+    of them fails. At the task's deadline there is no profile, unless only limits between points were still exceeded.
 
     Raises:
         InputError: fewer nodes than the path needs.
     """
-    return _plan(task, window, penalties, lambda problem, segment: (starts, WARM_START))
+    return _plan(task, window, lambda _interval: OPTIMUM, TUNING.enough)
 
 
-def plan_early(task: PlanningTask, enough: float = ENOUGH) -> Solution:
-    """Plan as plan_expert() does, but stop within about 0.02 % of the fastest, as refine() does, after one search.
+def plan_early(task: PlanningTask, enough: float = TUNING.enough) -> Solution:
+    """Plan as plan_expert() does, within about 0.02 % of the fastest, by one search: it takes half the time.
 
-    That takes half the time; and less where the limits are to leave room, of which `enough`, a share of a limit, may be
-    used between points. Raises as plan_expert() does.
+    It takes less where the limits are to leave room, of which `enough`, a fraction of a limit, may be used between
+    points. Raises as plan_expert() does.
     """
-
-    def searches(problem: Problem, segment: Segment) -> tuple[Sequence[Start], Sequence[Start]]:
-        interval = interval_of(segment, problem.coefficients)
-        return (early_start(interval),), refining_restarts(interval)[:2]
-
-    return _plan(task, LONG_WINDOW, None, searches, enough)
+    return _plan(task, TUNING.early_window, early, enough)
 
 
 def can_begin(task: PlanningTask) -> bool:
-    """Return whether the first BEGINNING of a task that starts in motion can be planned, whatever comes behind it.
+    """Return whether the beginning of a task that starts in motion can be planned, whatever comes behind it.
 
-    Where it cannot, neither can the whole; where it can the whole mostly can, as farther on the vehicle may fly slower.
-    Where one search only just succeeds, now and then the other does not: of 6,245 paths that began in motion this told
-    6,240 right, in half the time that plan_early() takes to fail, and a fifth of that to succeed.
+    Where it cannot, neither can all of it; where it can, the rest mostly can, as farther on the vehicle may fly slower.
+    Where one search only just succeeds, now and then the other does not: of 6,245 paths that began in motion this was
+    right about 6,240, in half the time that plan_early() takes to fail, and a fifth of that to succeed.
     """
     if task.refusal:
         return False
     moves = task.start.h**0.5 if task.start else 0.0  # units of s a second
-    intervals = math.ceil(BEGINNING * moves * task.nodes / task.path.end)
-    segment = segment_of(task, min(max(intervals, LEAST_BEGINNING), task.nodes))
+    intervals = math.ceil(TUNING.beginning * moves * task.nodes / task.path.end)
+    segment = segment_of(task, min(max(intervals, TUNING.least_beginning), task.nodes))
     problem = build_problem(segment, task.yaw_angle)
-    starts = (early_start(interval_of(segment, problem.coefficients)),)
+    starts = early(interval_of(segment, problem.coefficients)).starts
     return not rejection_reason(solve(problem, problem.coefficients, starts, task.deadline), segment)
 
 
+def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = TUNING.early_window) -> Solution:
+    """Refine a near-feasible profile on its grid to within about 0.02 % of the fastest.
+
+    Yaw is that of the profile, not of the task; where the task leaves it free it is optimised too. A profile may come
+    with a reason, which then says from where on it stayed as given.
+    """
+    *_, last = refinements(task, profile, window=window)
+    return last
+
+
+def refinements(
+    task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = TUNING.early_window
+) -> Iterator[Solution]:
+    """Yield the refined profile, after each round in which limits exceeded between points are lowered.
+
+    The first mostly passes the certificate. A path longer than `window` is planned window by window; its profile comes
+    once, after all rounds. A failure comes alone. At the task's deadline what is not refined yet stays as given.
+    """
+    began, nodes = time.perf_counter(), len(profile.s) - 1
+    whole, near = _given(task, profile)
+
+    def search(segment: Segment, near: NDArray) -> Tightened | str:
+        found = _hold_at_points(task, segment, near)
+        return found if isinstance(found, str) else _last(_tighten_refined(task, segment, found))
+
+    if len(windows_of(task.path, nodes, window, task.limits)) > 1:
+        yield _refined(task, whole, by_windows(whole, window, search, near), began)
+        return
+    found = _hold_at_points(task, whole, near)
+    if isinstance(found, str):
+        yield _refined(task, whole, found, began)
+        return
+    for held in _tighten_refined(task, whole, found):
+        yield _refined(task, whole, Joined(held.coefficients, (), held.iterations, held.rounds), began)
+
+
 def segment_of(task: PlanningTask, nodes: int) -> Segment:
-    """Return the first so many intervals of a task; the end of less than all of them is free."""
+    """Return the first intervals of a task, `nodes` of them; the end of fewer than all of them is free."""
     whole, step = nodes == task.nodes, task.path.end / task.nodes
     path = task.path if whole else task.path.part(0.0, nodes * step)
     yaw = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle, task.start, task.end)
@@ -110,31 +144,250 @@ def segment_of(task: PlanningTask, nodes: int) -> Segment:
     )  # fmt: skip
 
 
-def _plan(
-    task: PlanningTask,
-    window: WindowSize,
-    penalties: Penalties | None,
-    searches: Callable[[Problem, Segment], tuple[Sequence[Start], Sequence[Start]]],
-    enough: float = ENOUGH,
-) -> Solution:
-    """Plan a task from a guess; `searches` are those that begin there, and those that go on with lower limits."""
+class Start(NamedTuple):
+    """One search, and where it starts."""
+
+    search: Search
+    lowered: float = 0.0  # fraction of h by which it starts below the coefficients that it is given
+    goes_on: bool = False  # with the multipliers that are known
+
+
+class Strategy(NamedTuple):
+    """How a problem is searched: as the first of its starts that succeeds."""
+
+    starts: tuple[Start, ...]
+    restarts: tuple[Start, ...]  # from its solution, once limits are lowered
+
+
+# From a guess; what the first does not solve starts far inside the bounds, and at last slower.
+FROM_GUESS = (
+    Start(Search(iterations=60)),
+    Start(Search(barrier=0.1, push=0.3, iterations=100)),
+    Start(Search(barrier=0.1, push=0.3, iterations=100), lowered=0.5),
+)
+# From the solution of a problem almost the same: with its multipliers; near the bounds, and further off.
+FROM_NEARBY = (
+    Start(Search(barrier=3e-3, iterations=12), goes_on=True),
+    Start(Search(barrier=3e-3, push=1e-4, iterations=20)),
+    Start(Search(barrier=0.05, push=1e-3, iterations=40)),
+    *FROM_GUESS,
+)
+OPTIMUM = Strategy(FROM_GUESS, FROM_NEARBY)
+
+
+def early(interval: float) -> Strategy:
+    """Return the strategy that stops and gives up early, where an interval takes about that long, s."""
+    t = TUNING
+    start = Start(Search(
+        last_barrier=t.stop_barrier * interval, push=0.1, iterations=60,
+        feasibility=t.loose_factor * t.stop_feasibility, gradient=t.loose_factor * t.stop_gradient,
+        predicted_gradient_factor=t.predicted_gradient_factor, least_step=t.least_step,
+    ))  # fmt: skip
+    return Strategy((start,), refining(interval).restarts[:2])
+
+
+def refining(interval: float, *, capped: bool = False) -> Strategy:
+    """Return the strategy for a near-feasible profile, under speed caps or not, whose intervals take so long, s."""
+    t = TUNING
+    stop, fallback = t.stop_barrier * interval, t.fallback_barrier_factor * t.stop_barrier * interval
+    restart = _stopping_early(fallback if capped else stop, push=3e-3, iterations=20)
+    barriers, first = ((fallback,), 1.0) if capped else ((stop, fallback), t.first_barrier_factor)
+    starts = (_stopping_early(barrier, loosely=t.loose_factor, first=first) for barrier in barriers)
+    return Strategy((*starts, *FROM_GUESS), (restart._replace(goes_on=True), restart, *FROM_NEARBY))
+
+
+def _stopping_early(
+    barrier: float, push: float = 1e-2, iterations: int = 40, loosely: float = 1.0, first: float = 1.0
+) -> Start:
+    return Start(Search(
+        barrier=first * barrier, last_barrier=barrier, multipliers=TUNING.first_multipliers / first, push=push,
+        iterations=iterations, feasibility=loosely * TUNING.stop_feasibility, gradient=loosely * TUNING.stop_gradient,
+        predicted_gradient_factor=TUNING.predicted_gradient_factor,
+    ))  # fmt: skip
+
+
+class Attempt(NamedTuple):
+    """A solution of a problem as the solver left it."""
+
+    coefficients: NDArray  # (N+3, 1 or 2)
+    rows: NDArray  # (ROWS, P) at points
+    multipliers: Multipliers
+    solved: bool
+    iterations: int  # of all searches
+    message: str
+
+
+def solve(
+    problem: Problem, coefficients: NDArray, starts: Sequence[Start], deadline: Deadline = NEVER,
+    known: Multipliers | None = None,
+) -> Attempt:  # fmt: skip
+    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds, until the deadline.
+
+    Starts that go on take the multipliers that are `known` of a problem almost the same.
+    """
+    program, iterations = SplineProgram(problem), 0
+    for start in starts:
+        from_here = coefficients
+        if start.lowered:
+            from_here = lowered(coefficients, start.lowered, problem.ends.held, problem.unit**0.5 / problem.step)
+        result = minimise(program, program.v_of(from_here), start.search, deadline, known if start.goes_on else None)
+        iterations += result.iterations
+        if result.solved or deadline.passed:
+            break
+    return Attempt(
+        program.coefficients_of(result.v), program.rows_of(result.values.constraints), result.multipliers,
+        result.solved, iterations, result.message,
+    )  # fmt: skip
+
+
+def rejection_reason(attempt: Attempt, segment: Segment) -> str:
+    """Return why a solution must be rejected even if the solver reports success; empty where it need not be."""
+    if not attempt.solved:
+        return attempt.message
+    if not np.isfinite(attempt.coefficients).all():
+        return "the solution is not finite"
+    if (attempt.coefficients[:, 0] > 0.0).all():  # then so is h, which lies between its coefficients
+        return ""
+    profile = segment.profile(attempt.coefficients)
+    places = np.linspace(0.0, 1.0, 9)
+    nodes = np.arange(segment.layout.shape.nodes)
+    s = profile.s[:-1, None] + np.diff(profile.s)[:, None] * places
+    if (profile.at(s, np.repeat(nodes[:, None], len(places), axis=1)).h <= 0).any():
+        return "h falls to zero between nodes"
+    return ""
+
+
+def _tighten(
+    attempt: Attempt, problem: Problem, segment: Segment, restarts: Sequence[Start], deadline: Deadline, enough: float
+) -> Iterator[Tightened]:
+    """Lower limits and solve again until none is exceeded between points; yield what each round leads to.
+
+    Where nothing is exceeded at first, but for `enough`, a fraction of a limit, or the deadline has passed by then, the
+    attempt itself comes alone. A round that fails is the last: slowing will do the rest.
+    """
+    nodes = segment.layout.shape.nodes
+    dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes), segment.caps)
+    found = Tightened(attempt.coefficients, 0, attempt.iterations)
+    for done in range(TUNING.rounds):
+        violation = dense.violation(segment.profile(attempt.coefficients), segment.airframe, segment.limits)
+        if violation.worst <= enough or deadline.passed:
+            break
+        problem = tightened(problem, violation, attempt.rows)
+        attempt = solve(problem, attempt.coefficients, restarts, deadline, attempt.multipliers)
+        if rejection_reason(attempt, segment):
+            break
+        found = Tightened(attempt.coefficients, done + 1, found.iterations + attempt.iterations)
+        yield found
+    if not found.rounds:
+        yield found
+
+
+def _last(rounds: Iterator[Tightened]) -> Tightened:
+    *_, last = rounds
+    return last
+
+
+def _plan(task: PlanningTask, window: WindowSize, strategy_for: Callable[[float], Strategy], enough: float) -> Solution:
+    """Plan a task from a guess, by the strategy for intervals that take so long, s."""
     task.check_nodes()
     if task.refusal:
         return task.refusal
     began = time.perf_counter()
 
     def search(segment: Segment, _near: NDArray) -> Tightened | str:
-        problem = build_problem(segment, task.yaw_angle, penalties)
-        starts, restarts = searches(problem, segment)
-        attempt = solve(problem, problem.coefficients, starts, task.deadline)
-        return rejection_reason(attempt, segment) or tighten_until_feasible(
-            attempt, problem, segment, restarts, task.deadline, enough
+        problem = build_problem(segment, task.yaw_angle)
+        strategy = strategy_for(interval_of(segment, problem.coefficients))
+        attempt = solve(problem, problem.coefficients, strategy.starts, task.deadline)
+        return rejection_reason(attempt, segment) or _last(
+            _tighten(attempt, problem, segment, strategy.restarts, task.deadline, enough)
         )
 
     whole = segment_of(task, task.nodes)
     joined = by_windows(whole, window, search)
     if isinstance(joined, str) and sum(window) < task.nodes and not task.deadline.passed:
         joined = by_windows(whole, WindowSize(task.nodes, 0), search)  # no motion continues from a joint of two windows
+    return _solution(task, whole, joined, began)
+
+
+def _given(task: PlanningTask, profile: SpeedProfile) -> tuple[Segment, NDArray]:
+    """Return a task on the grid and with the yaw of a profile, and the profile's coefficients, (N+3, 1 or 2)."""
+    path, limits, nodes = task.path, task.limits, len(profile.s) - 1
+    free, step = task.yaw is YawMode.FREE, task.path.end / nodes
+    layout = layout_of(Shape(nodes, free, turning_limited=limits.angular_acceleration < math.inf))
+    ends, yaw = Ends(task.start, task.end), YawSpline.of(profile)
+    whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps, slowness_of(profile.h, limits))
+    near = np.maximum(h_coefficients(profile) / whole.unit, TUNING.floor)
+    near = led_into(near, whole.unit, step, task.start, task.end)[:, None]
+    if free:
+        near = np.column_stack([near, np.append(yaw.coefficients(step), 0.0)])
+        for state, rows in ((task.start, near[:2]), (task.end, near[-3:-1])):
+            if state:
+                rows[:, 1] = end_coefficients(state.yaw, state.dyaw * step)
+    return whole, near
+
+
+class _HeldAtPoints(NamedTuple):
+    """A solution that keeps its limits at points, and what it takes to go on from there."""
+
+    attempt: Attempt
+    problem: Problem
+    strategy: Strategy
+
+
+def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _HeldAtPoints | str:
+    """Refine the coefficients `near` until limits are kept at points, or return why that failed."""
+    step, capped = segment.path.end / segment.layout.shape.nodes, segment.caps is not None
+    strategy = refining(interval_of(segment, near), capped=capped)
+    begin = lowered(near, TUNING.initial_h_reduction, segment.ends.held, segment.unit**0.5 / step)
+    problem = build_problem(segment, task.yaw_angle, coefficients=begin)
+    attempt = _search_near(problem, strategy, capped, task.deadline)
+    if rejection_reason(attempt, segment) and not task.deadline.passed:  # not near enough
+        problem = build_problem(segment, task.yaw_angle)
+        attempt = solve(problem, problem.coefficients, FROM_GUESS, task.deadline)
+    return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, strategy)
+
+
+def _search_near(problem: Problem, strategy: Strategy, capped: bool, deadline: Deadline) -> Attempt:
+    """Search as the first of the strategy's starts that succeeds, and on from there if that stops far off."""
+    first, *others = strategy.starts
+    attempt = solve(problem, problem.coefficients, (first,), deadline)
+    steps = attempt.iterations
+    if attempt.solved and (capped or steps < TUNING.stall_iterations):
+        return attempt
+    if attempt.solved:  # it may have stalled at its bounds
+        last = first.search.last_barrier
+        search = replace(first.search, barrier=last, multipliers=TUNING.first_multipliers)
+        on = Start(search, lowered=TUNING.initial_h_reduction)
+        nearer = solve(problem, attempt.coefficients, (on,), deadline)
+    elif deadline.passed:
+        return attempt
+    else:
+        attempt = solve(problem, problem.coefficients, others, deadline)
+        steps += attempt.iterations
+        if not attempt.solved:
+            return attempt._replace(iterations=steps)
+        nearer = solve(problem, attempt.coefficients, strategy.restarts[:1], deadline, attempt.multipliers)
+    return (nearer if nearer.solved else attempt)._replace(iterations=steps + nearer.iterations)
+
+
+def _tighten_refined(task: PlanningTask, segment: Segment, found: _HeldAtPoints) -> Iterator[Tightened]:
+    return _tighten(found.attempt, found.problem, segment, found.strategy.restarts, task.deadline, TUNING.enough)
+
+
+def _solution(task: PlanningTask, whole: Segment, joined: Joined | str, began: float) -> Solution:
+    """Return the solution that windows were joined to; the search began at this time.perf_counter()."""
     if isinstance(joined, str):
-        return Solution(failed_status(task.deadline), None, joined)
-    return solution_of(whole, joined, began)
+        return Solution(Status.OUT_OF_TIME if task.deadline.passed else Status.NOT_CONVERGED, None, joined)
+    stats: dict[str, float | int | str] = {
+        "solve_seconds": time.perf_counter() - began,
+        "iterations": joined.iterations,
+        "rounds": joined.rounds,
+        "windows": 1 + len(joined.joints),
+        "solver": "interior point",
+    }
+    return Solution(Status.SOLVED, whole.profile(joined.coefficients), joined.unfinished, stats, joined.joints)
+
+
+def _refined(task: PlanningTask, whole: Segment, joined: Joined | str, began: float) -> Solution:
+    solution = _solution(task, whole, joined, began)
+    return replace(solution, reason=solution.reason and f"refining: {solution.reason}")

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.safety.feasibility import spare_thrust, spare_turning
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -12,18 +13,9 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_coefficients
 from cfplan.vehicle.yaw_spline import end_coefficients
 
-HIGHEST = 6.0  # h at most, where the path nearly stands still, in squares of the speed limit
-SHARE = 0.7  # of each limit that the guess uses
-WIDTH = 2.0  # intervals over which it is smoothed
-# Intervals over which h, and yaw, come away from a boundary state. In less they jerk; in more h is too fast to brake.
-H_BLEND, YAW_BLEND = 5.0, 4.0
-# Coefficients from an end that is held, where lowered() begins, and is complete; on a fine grid, where so few take no
-# time to pass, after as many as take LOWERED_TIME, s.
-LOWERED_FROM, LOWERED_TO = 3, 10
-LOWERED_TIME = 0.15
-
-_REACH = int(4.0 * WIDTH + 0.5)  # intervals
-_GAUSSIAN = np.exp(-0.5 / WIDTH**2 * np.arange(-_REACH, _REACH + 1) ** 2)
+_G = TUNING.guess
+_REACH = int(4.0 * _G.smoothing + 0.5)  # intervals
+_GAUSSIAN = np.exp(-0.5 / _G.smoothing**2 * np.arange(-_REACH, _REACH + 1) ** 2)
 _WEIGHTS = _GAUSSIAN / _GAUSSIAN.sum()
 
 
@@ -73,14 +65,14 @@ def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:
     x = np.arange(count) - 1.0
     last, slope = offsets[1], offsets[1] - offsets[0]
     left = np.clip(1.0 - x / (count - 2 - 2 * held), 0.0, 1.0)
-    return (last + x * (slope + last / H_BLEND)) * np.exp(-x / H_BLEND) * left**2 * (3.0 - 2.0 * left)
+    return (last + x * (slope + last / _G.h_blend)) * np.exp(-x / _G.h_blend) * left**2 * (3.0 - 2.0 * left)
 
 
 def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nodes: int, step: float) -> NDArray:
     """Return (N+2,) coefficients: turning ever less from a state, across to what leads into the other."""
 
     def turned(state: BoundaryState, distance: NDArray, towards: float) -> NDArray:
-        faded = YAW_BLEND * np.sign(distance) * (1.0 - np.exp(-np.abs(distance) / YAW_BLEND))
+        faded = _G.yaw_blend * np.sign(distance) * (1.0 - np.exp(-np.abs(distance) / _G.yaw_blend))
         return state.yaw + towards * state.dyaw * step * faded
 
     x = np.arange(nodes + 2) - 0.5
@@ -106,9 +98,9 @@ def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool], rate: 
     less = np.full(len(coefficients), float(share))
     for is_held, from_end, x in zip(held, (less, less[::-1]), (coefficients[1, 0], coefficients[-2, 0]), strict=True):
         if is_held:
-            to = max(LOWERED_TO, int(LOWERED_TIME * rate * np.sqrt(max(x, 0.0))))
+            to = max(_G.lowered_to, int(_G.lowered_time * rate * np.sqrt(max(x, 0.0))))
             count = min(len(less), to)
-            from_end[:count] *= np.clip((np.arange(count) - LOWERED_FROM + 1) / (to - LOWERED_FROM + 1), 0.0, 1.0)
+            from_end[:count] *= np.clip((np.arange(count) - _G.lowered_from + 1) / (to - _G.lowered_from + 1), 0.0, 1.0)
     result[:, 0] *= 1.0 - less
     return result
 
@@ -125,11 +117,11 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int)
     acceleration = min(limits.acceleration, GRAVITY * np.tan(min(limits.tilt, 1.0)), 4 * up / airframe.mass)
     turning = 0.5 * spare_turning(airframe, limits)
     h = np.minimum.reduce([
-        np.full(len(s), HIGHEST * limits.speed**2),
-        SHARE * limits.speed**2 / first**2,
-        SHARE * acceleration / second,
-        (0.7 * SHARE * limits.angular_velocity * GRAVITY / third) ** (2 / 3),
-        (0.7 * SHARE * turning * GRAVITY / fourth) ** 0.5,
+        np.full(len(s), _G.highest * limits.speed**2),
+        _G.usage * limits.speed**2 / first**2,
+        _G.usage * acceleration / second,
+        (0.7 * _G.usage * limits.angular_velocity * GRAVITY / third) ** (2 / 3),
+        (0.7 * _G.usage * turning * GRAVITY / fourth) ** 0.5,
     ])  # fmt: skip
     return np.exp(_smoothed_below(np.log(h), _WEIGHTS))
 
@@ -140,7 +132,7 @@ def _smoothed_below(values: NDArray, weights: NDArray) -> NDArray:
 
     In scipy.ndimage's order, to the last bit as that, which is slow to import.
     """
-    last, near, reach = len(values) - 1, int(WIDTH), len(weights) // 2
+    last, near, reach = len(values) - 1, int(_G.smoothing), len(weights) // 2
     least = np.empty(len(values))
     for n in range(len(values)):
         least[n] = values[max(n - near, 0)]

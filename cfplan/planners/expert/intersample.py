@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.machine_code import njit
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.safety import quantities
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import scaled
@@ -17,18 +18,10 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import SpeedProfile
 
-COUNT = 17  # places an interval
-# Places in brisk intervals: the END_INTERVALS at each end, where the thrust axis may swing to and fro within one, and
-# where the path turns by more than SHARP.
-FINE_COUNT = 65
-END_INTERVALS = 4
-SHARP = 0.25  # rad, an interval
-ALLOWANCE = 1.5e-3  # of the rows, kept free: certificates allow for their own sampling
-THRUST_ALLOWANCE = 4e-3  # likewise, of thrusts, which change fastest
-FINE_ALLOWANCE = 5e-3  # likewise in brisk intervals
-
 # Chebyshev-Lobatto: both ends of an interval, and closer together near them
-_PLACES, _FINE = ((1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (COUNT, FINE_COUNT))
+_PLACES, _FINE = (
+    (1.0 - np.cos(np.pi * np.arange(count) / (count - 1))) / 2.0 for count in (TUNING.places, TUNING.fine_places)
+)
 CONTINUOUS = np.flatnonzero(~quantities.JUMPS)
 
 
@@ -55,10 +48,10 @@ class DensePath:
         """Take `held`, (N,): how far, 0 to 1, a boundary state decides each interval; its violation counts less."""
         self.held = held
         step = path.end / nodes
-        brisk = turns(path, nodes) > SHARP
-        brisk[:END_INTERVALS] = brisk[-END_INTERVALS:] = True
+        refined = turns(path, nodes) > TUNING.sharp
+        refined[: TUNING.refined_at_ends] = refined[-TUNING.refined_at_ends :] = True
         self.allowance, self.begins, self.interval, self.places, s = _laid_out(
-            brisk, quantities.JUMPS, _PLACES, _FINE, step
+            refined, quantities.JUMPS, _PLACES, _FINE, step
         )
         self.derivatives = path.derivatives(s)[1:]
         self.caps = None if caps is None else caps.at(s)
@@ -84,30 +77,27 @@ class DensePath:
 
 @njit
 def _laid_out(
-    brisk: NDArray, jumps: NDArray, usual: NDArray, fine: NDArray, step: float
+    refined: NDArray, jumps: NDArray, usual: NDArray, fine: NDArray, step: float
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
     """Return the allowance of each interval, (N, MEASURES), and the first place of each, (N+1,); and of each place its
     interval, how far in s it lies in there, and s: one interval's after another's."""
-    allowance, begins = np.empty((len(brisk), len(jumps))), np.zeros(len(brisk) + 1, np.int64)
-    for k in range(len(brisk)):
-        begins[k + 1] = begins[k] + (len(fine) if brisk[k] else len(usual))
+    allowance, begins = np.empty((len(refined), len(jumps))), np.zeros(len(refined) + 1, np.int64)
+    for k in range(len(refined)):
+        begins[k + 1] = begins[k] + (len(fine) if refined[k] else len(usual))
         for row in range(len(jumps)):
-            allowance[k, row] = FINE_ALLOWANCE if brisk[k] else THRUST_ALLOWANCE if jumps[row] else ALLOWANCE
+            allowance[k, row] = (
+                TUNING.fine_allowance if refined[k] else TUNING.thrust_allowance if jumps[row] else TUNING.allowance
+            )
     interval, within, s = np.empty(begins[-1], np.int64), np.empty(begins[-1]), np.empty(begins[-1])
-    for k in range(len(brisk)):
-        places = fine if brisk[k] else usual
+    for k in range(len(refined)):
+        places = fine if refined[k] else usual
         for n in range(len(places)):
             at, x = begins[k] + n, step * places[n]
             interval[at], within[at], s[at] = k, x, step * k + x
     return allowance, begins, interval, within, s
 
 
-def _extremes_interpreted(measured: NDArray, begins: NDArray) -> NDArray:
-    highest, lowest = (extreme.reduceat(measured, begins[:-1], axis=1) for extreme in (np.maximum, np.minimum))
-    return np.concatenate([highest, lowest], axis=1)
-
-
-@njit(interpreted=_extremes_interpreted)
+@njit
 def _extremes(measured: NDArray, begins: NDArray) -> NDArray:
     """Return the highest of each row, (MEASURES, P), in each interval, then the lowest, (MEASURES, 2 N)."""
     rows, count = measured.shape[0], len(begins) - 1

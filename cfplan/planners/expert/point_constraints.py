@@ -4,8 +4,6 @@ Rows are those of the table of limited quantities (safety/quantities.py) but for
 airframe and limits are data, so that the same compiled functions (kernel.py) serve every problem.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,19 +23,6 @@ LEAST = 1e-6  # x below this counts as this: a solver that tries h < 0 must not 
 UNBOUNDED = 1e8  # stands for no limit, in a row's own unit
 
 
-@dataclass(frozen=True, slots=True)
-class Penalties:
-    """What a second of flight costs beyond its time; keeps solutions smooth and yaw from drifting."""
-
-    angular_acceleration: float = 1e-6  # s⁴/rad², per squared angular acceleration
-    yaw_rate: float = 1e-2  # s²/rad², per squared yaw rate; free yaw only
-    roughness: float = 1e-3  # s, per squared third derivative of h over h, in grid steps, an interval
-
-    def weights(self) -> tuple[float, float, float]:
-        """Return the weights of the kernels' penalty."""
-        return self.angular_acceleration, self.yaw_rate, self.roughness
-
-
 def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray:
     """Return (COMMON_DATA,), the same at every point; `scale` turns x into h in node units."""
     offsets, scales = quantities.scales(limits)
@@ -50,8 +35,3 @@ def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray
 def variables(free_yaw: bool) -> int:
     """Return how many numbers decide a point, and how many spline coefficients those."""
     return 7 if free_yaw else 4
-
-
-def family(free_yaw: bool) -> str:
-    """Return the name of the functions' family."""
-    return "free" if free_yaw else "given"

@@ -1,7 +1,11 @@
-"""The numbers of one speed-profile problem: a stretch of path and its limits at points, and how limits are lowered."""
+"""A speed-profile problem: a stretch of path, the points at which its limits hold, and how these are lowered.
 
-import math
+Its variables are coefficients of splines on the grid: a cubic one of x = h/unit and, where yaw is free, a quadratic one
+of yaw (transcription.py). Numbers are in node units: s counted in intervals of the grid.
+"""
+
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,27 +15,86 @@ from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import CONTINUOUS, Violation, spread
-from cfplan.planners.expert.layout import Layout
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.task import FREE_START
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
+from cfplan.vehicle import measures
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import SPEED
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile, yaw_within
 from cfplan.vehicle.profile_spline import spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
-MARGIN = 1e-3  # share by which limits are tightened, for what happens between points
-BLEND_INTERVALS = 5  # over which that margin grows from nothing, next to a boundary state that may lie at a limit
-# By how much limits are tightened around a joint, and over how many intervals on each side, so that the next window
-# has room.
-JOINT_MARGIN, AROUND_JOINT = 0.01, 6
-BOUNDARY_TOLERANCE = 0.1  # by which rows that a boundary state alone decides may exceed their limits: they are checked
-OVERTIGHTENING = 1.5  # times a violation between points, by which limits are lowered: the peak falls by less
-CEILING = 20.0  # h at most, where the path nearly stands still, in squares of the speed limit
-FLOOR = 1e-4  # coefficients of x at least
-BRISK = 4.0  # times the typical speed of a flight, above which a speed limit is too far off to measure by
 REST = 1e-9  # |γ'| below which a path stands still
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What a problem's structure depends on."""
+
+    nodes: int
+    free_yaw: bool
+    turning_limited: bool = False  # whether angular acceleration has a limit of its own
+    end_intervals: tuple[int, int] = (3, 3)  # intervals at each end with more points inside
+    end_places: tuple[float, ...] = (0.2, 0.5, 0.8)
+    middle_places: tuple[float, ...] = (0.5,)  # points inside every other interval
+    speed_places: tuple[float, ...] = (0.5,)  # where the speed limit holds besides the nodes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where the points lie: the first of all intervals, then the second of all, and so on.
+
+    The last one is repeated, without limits, until they fill the kernels' lanes.
+    """
+
+    shape: Shape
+    interval: NDArray  # (P,) of each point
+    place: NDArray  # (P,) in its interval, 0 to 1
+    weight: NDArray  # (P,) of the penalties: 1 at the left end of an interval, else 0
+    bounded: NDArray  # (ROWS, P) whether each row of point_constraints has its limits there
+    speed_interval: NDArray  # (N + 1 + N speed places,) where the speed limit holds: at the nodes, and then between
+    speed_place: NDArray  # likewise
+
+    @property
+    def s(self) -> NDArray:
+        """Return where the points lie, (P,), in intervals from the first node."""
+        return self.interval + self.place
+
+    @property
+    def speed_s(self) -> NDArray:
+        """Return where the speed limit holds, in intervals."""
+        return self.speed_interval + self.speed_place
+
+
+@lru_cache(maxsize=128)
+def layout_of(shape: Shape) -> Layout:
+    """Return the layout of a shape, made once a process."""
+    all_rows = np.ones(point_constraints.ROWS, dtype=bool)
+    all_rows[measures.ANGULAR_ACCELERATION] = shape.turning_limited
+    jumping = all_rows & point_constraints.JUMPS
+    k = np.arange(shape.nodes)
+    at_end = (k < shape.end_intervals[0]) | (k >= shape.nodes - shape.end_intervals[1])
+    of_end, of_middle = (0.0, *shape.end_places, 1.0), (0.0, *shape.middle_places, 1.0)
+    intervals, places = [], []
+    for j in range(max(len(of_end), len(of_middle))):
+        here = np.where(at_end, j < len(of_end), j < len(of_middle))
+        intervals.append(k[here])
+        places.append(np.where(at_end, (of_end + (1.0,) * j)[j], (of_middle + (1.0,) * j)[j])[here])
+    interval, place = np.concatenate(intervals), np.concatenate(places)
+    count, padding = len(interval), -len(interval) % point_constraints.LANES
+    interval, place = (np.append(each, np.repeat(each[-1:], padding)) for each in (interval, place))
+    # At an interval's right end the rest holds as it does at the next one's left end.
+    inner_right = (place == 1.0) & (interval < shape.nodes - 1)
+    bounded = np.where(inner_right, jumping[:, None], all_rows[:, None])
+    bounded[:, count:] = False
+    weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once an interval
+    weight[count:] = 0.0
+    node = np.arange(shape.nodes + 1)
+    speed_interval = np.concatenate([np.minimum(node, shape.nodes - 1), np.tile(node[:-1], len(shape.speed_places))])
+    speed_place = np.concatenate([(node == shape.nodes) * 1.0, np.repeat(np.array(shape.speed_places), shape.nodes)])
+    return Layout(shape, interval, place, weight, bounded, speed_interval, speed_place)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +138,13 @@ class Segment:
 
 
 def slowness_of(h: NDArray, limits: PlanLimits) -> float:
-    """Return the speed limit over BRISK times the typical speed of some h, (K,); at least 1.
+    """Return the speed limit over `speed_cap_ratio` times the typical speed of some h, (K,); at least 1.
 
-    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to FLOOR, and
-    the search would end before it began.
+    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to its `floor`,
+    and the search would end before it began.
     """
     middle = np.sort(h)[(len(h) - 1) // 2 : len(h) // 2 + 1]  # one or two: np.median() takes ten times as long
-    return max(1.0, limits.speed / (BRISK * (float(middle[0] + middle[-1]) / 2.0) ** 0.5))
+    return max(1.0, limits.speed / (TUNING.speed_cap_ratio * (float(middle[0] + middle[-1]) / 2.0) ** 0.5))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +158,7 @@ class Problem:
     step: float  # of s, an interval
     point_data: NDArray  # (POINT_DATA, P)
     common: NDArray  # (COMMON_DATA,)
-    penalties: NDArray  # (3,) weights
+    penalties: NDArray  # (3,) weights, of Penalties
     lower: NDArray  # (ROWS, P) bounds of the rows at points, infinite where there is none
     upper: NDArray  # (ROWS, P)
     highest: NDArray  # x at most where layout.speed_s says, by the speed limit
@@ -106,7 +169,6 @@ class Problem:
 def build_problem(
     segment: Segment,
     yaw_angle: float = 0.0,
-    penalties: point_constraints.Penalties | None = None,
     coefficients: NDArray | None = None,
 ) -> Problem:
     """Return the problem of a segment. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more.
@@ -116,13 +178,13 @@ def build_problem(
     layout, path, limits, ends = segment.layout, segment.path, segment.limits, segment.ends
     nodes = layout.shape.nodes
     step, unit = path.end / nodes, segment.unit
-    margin = MARGIN * (1.0 - held_by(ends, nodes))
+    margin = TUNING.margin * (1.0 - held_by(ends, nodes))
     if ends.joint is not None:
-        margin[ends.joint - AROUND_JOINT : ends.joint + AROUND_JOINT] = JOINT_MARGIN
+        margin[ends.joint - TUNING.around_joint : ends.joint + TUNING.around_joint] = TUNING.joint_margin
     s = layout.speed_s * step
-    speed = np.full(len(s), allowed_speed(limits.speed, segment.caps, s), dtype=float)
-    ceiling = CEILING * segment.slowness**2
-    nominal, highest = _highest(path(s, 1), layout.speed_interval, margin, speed, unit, ceiling)
+    nominal = np.linalg.norm(path(s, 1), axis=1)
+    speed = (1.0 - margin[layout.speed_interval]) * allowed_speed(limits.speed, segment.caps, s)
+    highest = np.minimum((speed / np.maximum(nominal, REST)) ** 2 / unit, TUNING.ceiling * segment.slowness**2)
     for node, boundary in ((0, ends.start), (nodes, ends.end)):
         if boundary:
             highest[node] = np.inf  # the state decides, and was checked
@@ -135,80 +197,38 @@ def build_problem(
     return Problem(
         layout, ends, (nominal[0] < REST, nominal[nodes] < REST), unit, step, _point_data(segment, step),
         point_constraints.common_data(segment.airframe, limits, unit / step**2),
-        np.array((penalties or point_constraints.Penalties()).weights()), lower, upper, highest,
+        np.array(TUNING.penalties), lower, upper, highest,
         (yaw_angle, yaw_angle + FREE_START), coefficients,
     )  # fmt: skip
 
 
-@njit(error_model="numpy")
-def _highest(
-    tangent: NDArray, interval: NDArray, margin: NDArray, speed: NDArray, unit: float, ceiling: float
-) -> tuple[NDArray, NDArray]:
-    """Return |γ'| where the speed limit holds, from γ', (K, 3), and x at most there by the speeds allowed, (K,)."""
-    nominal, highest = np.empty(len(tangent)), np.empty(len(tangent))
-    for n in range(len(tangent)):
-        nominal[n] = math.sqrt(tangent[n, 0] ** 2 + tangent[n, 1] ** 2 + tangent[n, 2] ** 2)
-        root = (1.0 - margin[interval[n]]) * speed[n] / max(nominal[n], REST)
-        highest[n] = min(root * root / unit, ceiling)
-    return nominal, highest
-
-
 def interval_of(segment: Segment, coefficients: NDArray) -> float:
     """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
-    slowness = float((1.0 / np.sqrt(segment.unit * np.maximum(coefficients[:, 0], FLOOR))).sum()) / len(coefficients)
-    return segment.path.end / segment.layout.shape.nodes * slowness
+    h = segment.unit * np.maximum(coefficients[:, 0], TUNING.floor)
+    return segment.path.end / segment.layout.shape.nodes * float((1.0 / np.sqrt(h)).sum()) / len(h)
 
 
 def _point_data(segment: Segment, step: float) -> NDArray:
     """Return the point data, (POINT_DATA, P), in node units."""
-    layout, yaw = segment.layout, segment.yaw
-    derivatives = segment.path.derivatives(layout.s * step)
-    data = np.empty((point_constraints.POINT_DATA, len(layout.interval)))
-    yaws = yaw.yaw, yaw.dyaw, yaw.ddyaw
-    _fill_point_data(data, derivatives, step, layout.interval, layout.place, layout.weight, *yaws)
-    return data
-
-
-@njit
-def _fill_point_data(
-    data: NDArray, derivatives: NDArray, step: float, interval: NDArray, place: NDArray, weight: NDArray, yaw: NDArray,
-    dyaw: NDArray, ddyaw: NDArray,
-) -> None:  # fmt: skip
-    for order in range(1, 5):
-        for axis in range(3):
-            for p in range(len(interval)):
-                data[3 * (order - 1) + axis, p] = derivatives[order, axis, p] * step**order
-    for p in range(len(interval)):
-        k = interval[p]
-        turned = yaw_within(place[p] * step, yaw[k], dyaw[k], ddyaw[k])
-        data[12, p], data[13, p] = place[p], weight[p]
-        data[14, p], data[15, p], data[16, p] = turned[0], turned[1] * step, turned[2] * step**2
+    layout, given, k = segment.layout, segment.yaw, segment.layout.interval
+    powers = np.array([step, step**2, step**3, step**2 * step**2])
+    of_path = segment.path.derivatives(layout.s * step)[1:] * powers[:, None, None]
+    yaw, dyaw, ddyaw = yaw_within(layout.place * step, given.yaw[k], given.dyaw[k], given.ddyaw[k])
+    return np.stack([*of_path.reshape(12, -1), layout.place, layout.weight, yaw, dyaw * step, ddyaw * step**2])
 
 
 def _limits_at_points(layout: Layout, ends: Ends, margin: NDArray) -> tuple[NDArray, NDArray]:
     """Return the lower and upper bounds of the rows at points, tightened by the margin of each interval, (N,)."""
-    last = layout.interval[-1] + 1.0 if ends.end else np.inf
-    return _tightened_by_margin(
-        layout.bounded, layout.interval, layout.place, margin, 0.0 if ends.start else -1.0, last,
-        point_constraints.LOWER, point_constraints.UPPER, point_constraints.JUMPS,
-    )  # fmt: skip
-
-
-@njit
-def _tightened_by_margin(
-    bounded: NDArray, interval: NDArray, place: NDArray, margin: NDArray, first: float, last: float, lower: NDArray,
-    upper: NDArray, jumps: NDArray,
-) -> tuple[NDArray, NDArray]:  # fmt: skip
-    """Return _limits_at_points; boundary states decide the points at `first` and `last`, in intervals."""
-    low, high = np.full(bounded.shape, -np.inf), np.full(bounded.shape, np.inf)
-    for row in range(len(bounded)):
-        for p in range(len(interval)):
-            if bounded[row, p]:
-                s = interval[p] + place[p]
-                decided = s in (first, last) and not jumps[row]
-                tighter = -BOUNDARY_TOLERANCE if decided else 2.0 * margin[interval[p]]  # as most rows are squares
-                low[row, p], high[row, p] = lower[row] + tighter, upper[row] - tighter
-    return low, high
+    decided = (layout.s == 0.0) & ends.held[0] | (layout.s == layout.shape.nodes) & ends.held[1]  # by boundary states
+    tighter = np.where(
+        decided & ~point_constraints.JUMPS[:, None],
+        -TUNING.boundary_tolerance,
+        2.0 * margin[layout.interval],  # as most rows are squares
+    )
+    return (
+        np.where(layout.bounded, point_constraints.LOWER[:, None] + tighter, -np.inf),
+        np.where(layout.bounded, point_constraints.UPPER[:, None] - tighter, np.inf),
+    )
 
 
 def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
@@ -217,25 +237,18 @@ def tightened(problem: Problem, violation: Violation, rows: NDArray) -> Problem:
     `rows`, (ROWS, P), is what the solution has at the points: a peak far from every point lowers the limits from there.
     """
     layout = problem.layout
-    over, under = (OVERTIGHTENING * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
+    over, under = (TUNING.overtightening * spread(each, CONTINUOUS) for each in (violation.upper, violation.lower))
     lower, upper = _lowered(
         problem.lower, problem.upper, rows, layout.bounded, layout.interval, violation.lower, violation.upper,
         under, over,
     )  # fmt: skip
-    highest = _slowed_between(problem.highest, over[:, SPEED], layout.speed_interval)
+    slower = np.maximum(over[:, SPEED], 0.0)  # in each interval; at nodes, of either side's
+    at_nodes, between = (
+        np.maximum(np.append(slower, 0.0), np.append(0.0, slower)),
+        layout.speed_interval[len(slower) + 1 :],
+    )
+    highest = problem.highest * (1.0 - np.append(at_nodes, slower[between]))
     return replace(problem, lower=lower, upper=upper, highest=highest)
-
-
-@njit
-def _slowed_between(highest: NDArray, over: NDArray, interval: NDArray) -> NDArray:
-    """Return `highest` lowered by `over`, (N,), of the intervals; at the nodes, which come first, of either side's."""
-    lowered, count = np.empty(len(highest)), len(over)
-    for p in range(len(highest)):
-        slower = 1.0 - max(over[interval[p]], 0.0)
-        if p <= count:
-            slower = min(1.0 - max(over[p], 0.0) if p < count else 1.0, 1.0 - max(over[p - 1], 0.0) if p > 0 else 1.0)
-        lowered[p] = highest[p] * slower
-    return lowered
 
 
 @njit
@@ -265,7 +278,7 @@ def _lowered(
 
 
 def held_by(ends: Ends, nodes: int) -> NDArray:
-    """Return (N,): 1 next to a boundary state, 0 from BLEND_INTERVALS on.
+    """Return (N,): 1 next to a boundary state, 0 from TUNING.blend on.
 
     A state may lie at a limit, and what follows is all but decided: there is no room to lower limits there.
     """
@@ -274,7 +287,7 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
     free = np.ones(nodes)
     distance = np.arange(nodes) + 0.5
     if ends.start and not ends.continues:
-        free = np.minimum(free, (distance - 1.5) / BLEND_INTERVALS)
+        free = np.minimum(free, (distance - 1.5) / TUNING.blend)
     if ends.end:
-        free = np.minimum(free, (nodes - distance - 1.5) / BLEND_INTERVALS)
+        free = np.minimum(free, (nodes - distance - 1.5) / TUNING.blend)
     return 1.0 - np.clip(free, 0.0, 1.0)

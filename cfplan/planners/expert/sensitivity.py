@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.expert import segment_of
-from cfplan.planners.expert.kernel import kernels_at_hand
+from cfplan.planners.expert.expert import Attempt, early, refining, rejection_reason, segment_of, solve
+from cfplan.planners.expert.kernel import Kernels
 from cfplan.planners.expert.problem import Problem, build_problem, interval_of
-from cfplan.planners.expert.search import Attempt, early_start, refining_starts, rejection_reason, solve
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE
 from cfplan.planners.task import PlanningTask
 from cfplan.vehicle.timing import duration_of
@@ -44,8 +43,8 @@ def sensitivity(task: PlanningTask, near: NDArray | None = None) -> Sensitivity 
     segment = segment_of(task, task.nodes)
     problem = build_problem(segment, task.yaw_angle)
     interval = interval_of(segment, problem.coefficients)
-    tries = [(near, refining_starts(interval)[:1])] if near is not None else []
-    for coefficients, starts in [*tries, (problem.coefficients, (early_start(interval),))]:
+    tries = [(near, refining(interval).starts[:1])] if near is not None else []
+    for coefficients, starts in [*tries, (problem.coefficients, early(interval).starts)]:
         attempt = solve(problem, coefficients, starts, task.deadline)
         if not rejection_reason(attempt, segment):
             duration = float(duration_of(segment.profile(attempt.coefficients)))
@@ -77,9 +76,7 @@ def _by_point_data(problem: Problem, attempt: Attempt, multipliers: NDArray) -> 
     moved = _MOVED * np.abs(problem.point_data[:12]).reshape(4, -1).max(axis=1).repeat(3)
     data = np.repeat(problem.point_data[:, None], 13, axis=1)  # unchanged, and with each of twelve rows perturbed
     data[np.arange(12), np.arange(1, 13)] += moved[:, None]
-    kernels = kernels_at_hand()(
-        free_yaw, data.reshape(len(data), -1), problem.common, OBJECTIVE_SCALE * problem.penalties, 0
-    )
+    kernels = Kernels(free_yaw, data.reshape(len(data), -1), problem.common, OBJECTIVE_SCALE * problem.penalties, 0)
     kernels.coefficients[:] = np.tile(local, 13)
     rows, penalty = kernels.evaluate()
     of_rows = (rows.reshape(-1, 13, points) * multipliers.reshape(-1, 1, points)).sum(axis=0)

@@ -1,11 +1,18 @@
 """The speed-profile problem as a nonlinear program of its free spline coefficients.
 
-Its constraints are the kernel's rows at all points, and then what is linear in the coefficients: h where the speed
-limit holds, that coefficients of h are positive, and where yaw starts.
+Coefficients lie in a table: N+3 of h in its first column and, where yaw is free, N+2 of yaw in its second. Read row by
+row it is the vector v of variables, in which an interval's coefficients lie side by side. A boundary state fixes three
+coefficients of h and two of yaw; at a rest the first four of h have one value, so that h is constant in that interval,
+and the first two of yaw.
+
+Constraints are the kernel's rows at all points, and then what is linear in the coefficients: h where the speed limit
+holds, that coefficients of h are positive, and where yaw starts.
 """
 
 import math
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from typing import NamedTuple
 
 import numpy as np
 from numba.extending import register_jitable
@@ -13,11 +20,12 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.planners.expert import point_constraints
-from cfplan.planners.expert.kernel import Kernels, kernels_at_hand
-from cfplan.planners.expert.layout import variables_of
-from cfplan.planners.expert.problem import FLOOR, Problem
+from cfplan.planners.expert.kernel import Kernels
+from cfplan.planners.expert.problem import Layout, Problem
+from cfplan.planners.expert.tuning import TUNING
 from cfplan.planners.solver.barrier import bounds_of
 from cfplan.planners.solver.interior_point import Linearisation, Values
+from cfplan.vehicle import yaw_spline
 from cfplan.vehicle.profile_spline import weights_at
 
 OBJECTIVE_SCALE = 1000.0  # of the cost in seconds, so that multipliers are about 1
@@ -25,19 +33,108 @@ OBJECTIVE_SCALE = 1000.0  # of the cost in seconds, so that multipliers are abou
 _PLACES = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
 _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
 _AT_PLACES = np.stack(weights_at(_PLACES), axis=-1)
+_FIXED = -1
 _FREELY = {"contract", "reassoc", "nsz"}  # freedom in the order of sums that lets NaN survive
+
+
+class Sparsity(NamedTuple):
+    """How v, the intervals and the points belong together, for compiled loops.
+
+    Points, and linear rows, lie in runs: of as many intervals, one after another. (R, 3): the first point of each run,
+    its interval, and how many. So the loops pass through memory in order, several numbers at a time, which takes
+    unsigned numbers: compiled code looks at the sign of an index.
+    """
+
+    runs: NDArray  # of the P points
+    slots: NDArray  # (k, N) entry of v of each of an interval's coefficients, -1 where it is fixed
+    entries: NDArray  # (2, k(k+1)/2, N) of the flattened matrix for each pair, -1 if fixed, and how often it counts
+    linear: NDArray  # (4, E) weights of four of an interval's coefficients in each linear row
+    linear_runs: NDArray  # of the E rows
+    of_yaw: int  # how many of the linear rows, the last ones, weigh yaw's coefficients, not those of h
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Variables:
+    """Which coefficients are variables."""
+
+    slots: NDArray  # (N+3, 1 or 2) entry of v of each coefficient, -1 where it is fixed
+    local: NDArray  # (k, N) where an interval's coefficients lie in the flattened table
+    positive: int  # how many coefficients of h have an entry of v of their own
+    size: int  # of v
+    band: int  # how far apart two coefficients that meet can be
+    sparsity: Sparsity
+
+
+@lru_cache(maxsize=128)
+def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> Variables:
+    """Return the variables, where each end is held by a boundary state or not, and at rest or not."""
+    nodes, free_yaw = layout.shape.nodes, layout.shape.free_yaw
+    table, own = _slots(nodes, 2 if free_yaw else 1, held, rests)
+    k = point_constraints.variables(free_yaw)
+    local = (
+        np.array([0, 1, 2, 3, 0, 1, 2][:k])[:, None] + np.arange(nodes),
+        np.array([0, 0, 0, 0, 1, 1, 1][:k])[:, None],
+    )
+    slots = table[local]
+    free = np.where(slots >= 0, slots, slots.max(axis=0))
+    band = int((free.max(axis=0) - free.min(axis=0)).max())
+    right, left = np.array([(a, b) for b in range(k) for a in range(b, k)]).T
+    low, high = np.minimum(slots[left], slots[right]), np.maximum(slots[left], slots[right])
+    entry = np.where(low >= 0, high * (band + 1) + high - low, _FIXED)
+    entries = np.stack([entry, np.where((low == high) & (left != right)[:, None], 2, 1)])
+    positive = np.flatnonzero(own[:, 0])
+    sparsity = Sparsity(_runs(layout.interval), slots, entries, *_linear_rows(layout, positive))
+    return Variables(table, local[0] * table.shape[1] + local[1], len(positive), table.size, band, sparsity)
+
+
+def _slots(nodes: int, columns: int, held: tuple[bool, bool], rests: tuple[bool, bool]) -> tuple[NDArray, NDArray]:
+    """Return the entry of v of each coefficient, -1 where it is fixed; and which have an entry of their own."""
+    own = np.arange((nodes + 3) * columns).reshape(nodes + 3, columns)
+    slots = own.copy()
+    for end, (h, yaw) in enumerate((
+        ([0, 1, 2, 3], [0, 1]), ([nodes + 2, nodes + 1, nodes, nodes - 1], [nodes + 1, nodes])
+    )):  # fmt: skip
+        if held[end]:
+            slots[h[:3], 0] = _FIXED
+            if columns == 2:
+                slots[yaw, 1] = _FIXED
+        elif rests[end]:
+            slots[h, 0] = slots[h[3], 0]
+            if columns == 2:
+                slots[yaw, 1] = slots[yaw[1], 1]
+    if columns == 2:
+        slots[-1, 1] = _FIXED  # yaw has a coefficient less
+    return slots, slots == own
+
+
+def _linear_rows(layout: Layout, positive: NDArray) -> tuple[NDArray, NDArray, int]:
+    """Return (weights (4, E), runs, how many of yaw): h where the speed limit holds, its coefficients, yaw's start."""
+    of_positive = np.clip(positive - 1, 0, layout.shape.nodes - 1)
+    weights = [np.stack(weights_at(layout.speed_place)), np.eye(4)[positive - of_positive].T]
+    interval = [layout.speed_interval, of_positive]
+    if layout.shape.free_yaw:
+        weights.append(np.append(0.0, yaw_spline.AT_NODE[0])[:, None])
+        interval.append(np.zeros(1, dtype=int))
+    linear = np.ascontiguousarray(np.concatenate(weights, axis=1))
+    return linear, _runs(np.concatenate(interval)), int(layout.shape.free_yaw)
+
+
+def _runs(interval: NDArray) -> NDArray:
+    """Return the runs, (R, 3), in which these intervals follow one another."""
+    first = np.flatnonzero(np.diff(interval, prepend=-2) != 1)
+    return np.stack([first, interval[first], np.diff(first, append=len(interval))], axis=1).astype(np.uint64)
 
 
 class SplineProgram:
     """f and g by v, see interior_point.NonlinearProgram; and the way from tables of coefficients to v and back."""
 
-    def __init__(self, problem: Problem, kernels: type[Kernels] | None = None) -> None:
+    def __init__(self, problem: Problem) -> None:
         """Fix what a boundary state decides at its value in the problem's table."""
         self._variables = it = variables_of(problem.layout, problem.ends.held, problem.rests)
         self._fixed = problem.coefficients
         self._fixed_local = problem.coefficients.ravel()[it.local]
         self._linear = it.sparsity.linear.shape[1]
-        self._kernels = (kernels or kernels_at_hand())(
+        self._kernels = Kernels(
             problem.layout.shape.free_yaw, problem.point_data, problem.common, OBJECTIVE_SCALE * problem.penalties,
             self._linear,
         )  # fmt: skip
@@ -47,18 +144,26 @@ class SplineProgram:
         self.bounds = self._bounds(problem)
 
     def _bounds(self, problem: Problem) -> NDArray:
-        it = self._variables
-        least, most = (-np.inf, np.inf) if problem.ends.start else map(float, problem.first_yaw)
-        lower, upper = _limits(problem.lower, problem.upper, problem.highest, self._linear, it.positive, (least, most))
+        """Return the bounds of all constraints, with those of the linear ones behind those at points."""
+        positive, of_yaw = self._variables.positive, self._variables.sparsity.of_yaw
+        yaw = [(-np.inf, np.inf) if problem.ends.start else problem.first_yaw] * of_yaw
+        least, most = np.reshape(yaw, (of_yaw, 2)).T
+        open_below, floor = np.full(len(problem.highest), -np.inf), np.full(positive, TUNING.floor)
+        lower = np.concatenate([problem.lower.ravel(), open_below, floor, least])
+        upper = np.concatenate([problem.upper.ravel(), problem.highest, np.full(positive, np.inf), most])
         return bounds_of(lower, upper)
 
     def v_of(self, coefficients: NDArray) -> NDArray:
         """Return the variables of a table; the smallest counts where several have one value."""
-        return _smallest(coefficients, self._variables.slots, self._variables.size)
+        slots = self._variables.slots
+        v = np.full(self._variables.size, np.inf)
+        np.minimum.at(v, slots[slots >= 0], coefficients[slots >= 0])
+        return np.where(np.isfinite(v), v, 0.0)
 
     def coefficients_of(self, v: NDArray) -> NDArray:
         """Return the table, (N+3, 1 or 2)."""
-        return _table(v, self._variables.slots, self._fixed)
+        slots = self._variables.slots
+        return np.where(slots >= 0, v[slots], self._fixed)
 
     def rows_of(self, constraints: NDArray) -> NDArray:
         """Return the (ROWS, P) rows at points of constraints, (m,)."""
@@ -83,49 +188,6 @@ class SplineProgram:
         """Give the kernels the coefficients at v."""
         it = self._variables.sparsity
         _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
-
-
-@njit
-def _limits(lower, upper, highest, linear, positive, yaw):
-    """Return the least and most of all constraints, (m,) each, with those of the linear ones behind those at points."""
-    points, behind = lower.size, lower.size + len(highest)
-    low, high = np.full(points + linear, -np.inf), np.full(points + linear, np.inf)
-    count = lower.shape[1]
-    for row in range(lower.shape[0]):
-        for p in range(count):
-            low[row * count + p], high[row * count + p] = lower[row, p], upper[row, p]
-    for j in range(len(highest)):
-        high[points + j] = highest[j]
-    for j in range(positive):
-        low[behind + j] = FLOOR
-    if behind + positive < len(low):  # the last is where yaw starts
-        low[-1], high[-1] = yaw
-    return low, high
-
-
-@njit
-def _table(v, slots, fixed):
-    """Return the table of coefficients, of which those without an entry of v are `fixed`."""
-    table = fixed.copy()
-    for n in range(table.shape[0]):
-        for column in range(table.shape[1]):
-            if slots[n, column] >= 0:
-                table[n, column] = v[slots[n, column]]
-    return table
-
-
-@njit
-def _smallest(table, slots, size):
-    v = np.full(size, np.inf)
-    for n in range(table.shape[0]):
-        for column in range(table.shape[1]):
-            at = slots[n, column]
-            if at >= 0:
-                v[at] = min(v[at], table[n, column])
-    for k in range(size):
-        if not np.isfinite(v[k]):
-            v[k] = 0.0
-    return v
 
 
 @register_jitable
@@ -244,37 +306,7 @@ def _add_time(local, scale, gradients, hessian):
                     row[i] += bend[i] * both
 
 
-def _intervals(runs):
-    """Return the interval of each point of all runs, (P,)."""
-    return np.concatenate([np.arange(first, first + count) for _, first, count in runs.tolist()])
-
-
-def _assemble_interpreted(at_points, sparsity, terms, local, scale, gradients, matrix):
-    (k, count), kinds, linear = local.shape, len(terms), sparsity.linear
-    interval, linear_interval = _intervals(sparsity.runs), _intervals(sparsity.linear_runs)
-    by_interval = np.array([np.bincount(interval, row, count) for row in at_points])
-    of_gradients, of_hessian = by_interval[: kinds * k], by_interval[kinds * k :]
-    of_h = linear.shape[1] - sparsity.of_yaw
-    for rows, first in ((slice(0, of_h), 0), (slice(of_h, None), k - 4)):
-        weights, at = linear[:, rows], linear_interval[rows]
-        of_rows = terms[:, terms.shape[1] - linear.shape[1] :][:, rows]
-        for b in range(4):
-            for kind in range(1, kinds):
-                of_gradients[kind * k + first + b] += np.bincount(at, of_rows[kind] * weights[b], count)
-            for a in range(b, 4):
-                added = np.bincount(at, of_rows[0] * weights[b] * weights[a], count)
-                of_hessian[_entry(first + b, first + a, k)] += added
-    _add_time(local, scale, of_gradients, of_hessian)
-    free = sparsity.slots >= 0
-    for kind in range(kinds):
-        of_kind = of_gradients[kind * k : (kind + 1) * k]
-        gradients[kind] = np.bincount(sparsity.slots[free], of_kind[free], gradients.shape[1])
-    entry, times = sparsity.entries
-    free = entry >= 0
-    matrix[:] = np.bincount(entry[free], (times * of_hessian)[free], matrix.size).reshape(matrix.shape)
-
-
-@njit(interpreted=_assemble_interpreted, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
     """Add up gradients and matrix, zero at first, from the kernel's at points, the linear constraints and the time."""
     slots, entries, kinds = sparsity.slots, sparsity.entries, len(terms)
@@ -295,16 +327,7 @@ def _assemble(at_points, sparsity, terms, local, scale, gradients, matrix):
                 flat[entries[0, e, i]] += entries[1, e, i] * of_hessian[e, i]
 
 
-def _jvp_interpreted(jacobian, sparsity, dv):
-    local = np.where(sparsity.slots >= 0, dv[sparsity.slots], 0.0)
-    by_coefficient = jacobian.reshape(len(local), -1, jacobian.shape[1])
-    of_points = np.einsum("arp,ap->rp", by_coefficient, local[:, _intervals(sparsity.runs)])
-    of_linear = np.empty(sparsity.linear.shape[1])
-    _weigh(sparsity, local, of_linear)
-    return np.append(of_points, of_linear)
-
-
-@njit(interpreted=_jvp_interpreted, error_model="numpy", fastmath=_FREELY)
+@njit(error_model="numpy", fastmath=_FREELY)
 def _jvp(jacobian, sparsity, dv):
     """Return J dv, (m,); `jacobian` is the kernel's at points."""
     k, points = len(sparsity.slots), jacobian.shape[1]

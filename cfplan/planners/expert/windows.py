@@ -4,37 +4,27 @@ Each window begins in the state where the kept part of the one before ends, and 
 than it takes to brake. Joints are crossed a little below the limits.
 """
 
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.deadline import Deadline
 from cfplan.geometry.path import Path
-from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.problem import Ends, Segment
-from cfplan.planners.expert.tightening import Tightened
-from cfplan.planners.solution import Solution, Status
+from cfplan.planners.expert.problem import Ends, Segment, Shape, layout_of
+from cfplan.planners.expert.tuning import TUNING, WindowSize
 from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.profile_spline import node_values
 from cfplan.vehicle.yaw_spline import YawSpline
 
-# m that a window looks ahead beyond twice the braking distance: attitude takes time to turn, and curves leave little
-# acceleration to brake with. Windows then fail on 2 of 160 paths of 40 to 100 m; with 0.5 m they fail on 8.
-LOOKAHEAD = 2.5
 
+class Tightened(NamedTuple):
+    """A window's solution, which keeps its limits between the points too, as far as lowering them led."""
 
-class WindowSize(NamedTuple):
-    """How many intervals of a path are planned at once."""
-
-    kept: int
-    ahead: int  # beyond those, planned and not kept
-
-
-LONG_WINDOW = WindowSize(kept=224, ahead=32)  # for searches that stop early
+    coefficients: NDArray  # (N+3, 1 or 2)
+    rounds: int  # of tightening
+    iterations: int  # of all searches
 
 
 class Joined(NamedTuple):
@@ -54,7 +44,7 @@ def windows_of(path: Path, nodes: int, size: WindowSize, limits: PlanLimits) -> 
     """
     spacing = np.linalg.norm(path(np.linspace(0.0, path.end, nodes + 1), 1), axis=1) * (path.end / nodes)
     length = np.append(0.0, np.cumsum((spacing[1:] + spacing[:-1]) / 2.0))  # m, of the path up to each node
-    far_enough = np.searchsorted(length, length + limits.speed**2 / limits.acceleration + LOOKAHEAD)
+    far_enough = np.searchsorted(length, length + limits.speed**2 / limits.acceleration + TUNING.lookahead)
     seen = np.minimum(far_enough, nodes).tolist()  # by node: how far a window looks that keeps the intervals before it
     windows: list[tuple[int, int, int]] = []
     first = 0
@@ -124,20 +114,3 @@ def _state(rows: NDArray, yaw_given: YawSpline, unit: float, step: float) -> Bou
     if rows.shape[1] == 2:
         yaw, dyaw = (rows[0, 1] + rows[1, 1]) / 2, (rows[1, 1] - rows[0, 1]) / step
     return BoundaryState(float(h), float(slope / step), float(bend / step**2), float(yaw), float(dyaw))
-
-
-def failed_status(deadline: Deadline) -> Status:
-    """Return what a search that failed is called."""
-    return Status.OUT_OF_TIME if deadline.passed else Status.NOT_CONVERGED
-
-
-def solution_of(whole: Segment, joined: Joined, began: float) -> Solution:
-    """Return the solution that windows were joined to; the search began at this time.perf_counter()."""
-    stats: dict[str, float | int | str] = {
-        "solve_seconds": time.perf_counter() - began,
-        "iterations": joined.iterations,
-        "rounds": joined.rounds,
-        "windows": 1 + len(joined.joints),
-        "solver": "interior point",
-    }
-    return Solution(Status.SOLVED, whole.profile(joined.coefficients), joined.unfinished, stats, joined.joints)

@@ -125,14 +125,7 @@ def _largest(values):
     return largest
 
 
-def _errors_interpreted(g: NDArray, bounds: NDArray, slacks: NDArray, barrier: float) -> Errors:
-    lower, upper, has_low, has_high, bounded = bounds
-    s, low, high = slacks
-    off = np.maximum(abs(low * (s - lower) - has_low * barrier), abs(high * (upper - s) - has_high * barrier))
-    return Errors(float((bounded * abs(g - s)).max()), float(off.max()))
-
-
-@njit(interpreted=_errors_interpreted, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def errors(g, bounds, slacks, barrier):
     """Return the Errors, of finite numbers."""
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -157,22 +150,7 @@ def search_direction(
     return SearchDirection(step, *_search_direction(g, dg, bounds, slacks, barrier, most, step))
 
 
-def _search_direction_interpreted(
-    g: NDArray, dg: NDArray, bounds: NDArray, slacks: NDArray, barrier: float, most: float, step: NDArray
-) -> tuple[float, float, float]:
-    lower, upper, has_low, has_high, bounded = bounds
-    s, low, high = slacks
-    below, above, d = s - lower, upper - s, bounded * (g - s + dg)
-    step[0] = d
-    step[1] = (has_low * barrier - low * d) / below - low
-    step[2] = (has_high * barrier + high * d) / above - high
-    fastest = float(np.maximum(d / above, -d / below).max())
-    fastest_dual = float(np.maximum(-step[1] / (low + 1.0 - has_low), -step[2] / (high + 1.0 - has_high)).max())
-    slope = barrier * float((has_high / above - has_low / below) @ d)
-    return slope, min(1.0, most / max(fastest, 1e-30)), min(1.0, most / max(fastest_dual, 1e-30))
-
-
-@njit(interpreted=_search_direction_interpreted, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def _search_direction(g, dg, bounds, slacks, barrier, most, step):
     """Fill in the step; return the rest of the SearchDirection."""
     lower, upper, has_low, has_high, bounded = bounds[0], bounds[1], bounds[2], bounds[3], bounds[4]
@@ -198,16 +176,7 @@ def _search_direction(g, dg, bounds, slacks, barrier, most, step):
     return barrier * slope, min(1.0, share), min(1.0, share_dual)
 
 
-def _merit_terms_interpreted(
-    g: NDArray, bounds: NDArray, slacks: NDArray, step: NDArray, share: float, barrier: float, _rows: int
-) -> tuple[float, float]:
-    lower, upper, has_low, has_high, bounded = bounds
-    slack = slacks[0] + share * step[0]
-    walls = np.log(has_low * (slack - lower) + 1.0 - has_low) + np.log(has_high * (upper - slack) + 1.0 - has_high)
-    return float(bounded @ abs(g - slack)), -barrier * float(walls.sum())
-
-
-@njit(interpreted=_merit_terms_interpreted, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def merit_terms(g, bounds, slacks, step, share, barrier, rows):
     """Return (Σ |g - s|, the barrier's cost) after a share of the step.
 
@@ -247,24 +216,7 @@ def accept_step(
     return after, terms, Errors(*_accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms))
 
 
-def _accept_step_interpreted(
-    g: NDArray, bounds: NDArray, slacks: NDArray, step: NDArray, share: float, share_dual: float, barrier: float,
-    after: NDArray, terms: NDArray,
-) -> Errors:  # fmt: skip
-    lower, upper, has_low, has_high, bounded = bounds
-    s = slacks[0] + share * step[0]
-    by_below, by_above = has_low / (s - lower), has_high / (upper - s)
-    low, high = (
-        np.clip(slacks[k] + share_dual * step[k], barrier * by / COMPLEMENTARY, barrier * by * COMPLEMENTARY)
-        for k, by in ((1, by_below), (2, by_above))
-    )
-    after[:] = s, low, high
-    sigma = low * by_below + high * by_above
-    terms[:] = sigma, high - low, by_above - by_below, sigma * bounded * (g - s)
-    return _errors_interpreted(g, bounds, after, barrier)
-
-
-@njit(interpreted=_accept_step_interpreted, error_model="numpy", fastmath=_SUMS)
+@njit(error_model="numpy", fastmath=_SUMS)
 def _accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms):
     """Fill in the slacks after the step, and the terms; return the Errors.
 

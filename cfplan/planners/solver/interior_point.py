@@ -84,7 +84,7 @@ class Search:
     last_barrier: float = 3e-3
     gradient: float = 1e-2  # of the Lagrangian, at the end
     feasibility: float = 1e-5  # of the constraints, at the end
-    left_by_step: float | None = None  # share of the gradient that a whole step leaves; None: it is always computed
+    predicted_gradient_factor: float | None = None  # of the gradient, left by a full step; None: always computed
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
     multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
     iterations: int = 100
@@ -203,8 +203,8 @@ def minimise(
         )
         whole = step.share == direction.share_dual == 1.0
         del direction
-        if search.left_by_step is not None and whole and barrier <= search.last_barrier:
-            left = search.left_by_step * off_gradient
+        if search.predicted_gradient_factor is not None and whole and barrier <= search.last_barrier:
+            left = search.predicted_gradient_factor * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
                 return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
     return ended(False, search.iterations, f"not solved in {search.iterations} iterations")

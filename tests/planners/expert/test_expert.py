@@ -11,7 +11,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.planners.expert.expert import can_begin, plan_early, plan_expert
-from cfplan.planners.expert.windows import WindowSize
+from cfplan.planners.expert.tuning import WindowSize
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.planners import default_nodes

@@ -8,9 +8,9 @@ import pytest
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
 from cfplan.geometry.yaw import YawMode
-from cfplan.planners.expert.expert import plan_expert
-from cfplan.planners.expert.refine import refine
-from cfplan.planners.expert.windows import LONG_WINDOW, WindowSize, windows_of
+from cfplan.planners.expert.expert import plan_expert, refine
+from cfplan.planners.expert.tuning import TUNING, WindowSize
+from cfplan.planners.expert.windows import windows_of
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
@@ -55,10 +55,10 @@ def test_a_profile_near_the_experts_becomes_as_fast_and_certified_in_fewer_steps
 
 @pytest.mark.parametrize("spacing", [1.0, 0.1, 0.01])
 def test_windows_cover_a_path_and_each_looks_ahead_far_enough_to_brake(spacing):
-    (kept, ahead), limits = LONG_WINDOW, LIMIT_SETS["hardware"].limits
+    (kept, ahead), limits = TUNING.early_window, LIMIT_SETS["hardware"].limits
     for nodes in (1, 100, kept + ahead, kept + ahead + 1, 1000):
         line = min_snap([[0, 0, 1], [nodes * spacing, 0, 1]])
-        windows = windows_of(line, nodes, LONG_WINDOW, limits)
+        windows = windows_of(line, nodes, TUNING.early_window, limits)
         assert windows[0][0] == 0
         assert windows[-1][1:] == (nodes, nodes)
         places = line(np.linspace(0.0, line.end, nodes + 1))[:, 0]

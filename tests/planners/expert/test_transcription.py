@@ -1,23 +1,27 @@
 """The problem behind the expert: derivatives, machine code, what is believed, and how limits are lowered."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
+from numba import types
+from numba.extending import intrinsic
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.random_paths import random_waypoints
-from cfplan.planners.expert import derivatives, expert, kernel
-from cfplan.planners.expert.expert import plan_expert
+from cfplan.machine_code import njit
+from cfplan.planners.expert import expert
+from cfplan.planners.expert.derivatives import point_kernels
+from cfplan.planners.expert.expert import FROM_GUESS, Attempt, plan_expert, solve
 from cfplan.planners.expert.initial_guess import guess
 from cfplan.planners.expert.intersample import Violation
-from cfplan.planners.expert.kernel import CompiledKernels, InterpretedKernels
-from cfplan.planners.expert.layout import Shape, layout_of
-from cfplan.planners.expert.point_constraints import Penalties
-from cfplan.planners.expert.problem import Ends, Segment, build_problem, tightened
-from cfplan.planners.expert.search import COLD_START, Attempt, solve
+from cfplan.planners.expert.kernel import Kernels
+from cfplan.planners.expert.point_constraints import ROWS
+from cfplan.planners.expert.problem import Ends, Segment, Shape, build_problem, layout_of, tightened
 from cfplan.planners.expert.transcription import OBJECTIVE_SCALE, SplineProgram
+from cfplan.planners.expert.vector_code import generator
 from cfplan.planners.solution import Status
-from cfplan.planners.solver.interior_point import Search, minimise
 from cfplan.planners.task import PlanningTask
 from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LIMIT_SETS
@@ -34,8 +38,8 @@ def segment_of(shape: Shape) -> Segment:
     return Segment(PATH, HARDWARE.airframe, HARDWARE.limits, Ends(None, None), yaw, layout_of(shape))
 
 
-def problem_of(shape: Shape, penalties: Penalties | None = None):
-    return build_problem(segment_of(shape), 0.2, penalties)
+def problem_of(shape: Shape):
+    return build_problem(segment_of(shape), 0.2)
 
 
 def near_the_guess(problem, size: float, seed: int = 5):
@@ -45,7 +49,7 @@ def near_the_guess(problem, size: float, seed: int = 5):
 
 
 def test_the_cost_is_the_time_of_flight():
-    problem = problem_of(Shape(60, False), Penalties(0.0, 0.0, 0.0))
+    problem = replace(problem_of(Shape(60, False)), penalties=np.zeros(3))
     program, v = near_the_guess(problem, 0.002)
     trajectory = Trajectory(PATH, segment_of(Shape(60, False)).profile(program.coefficients_of(v)), HARDWARE.airframe)
     assert program.evaluate(v).cost / OBJECTIVE_SCALE == pytest.approx(trajectory.duration, rel=1e-6)
@@ -110,7 +114,7 @@ def test_what_a_problem_hands_out_stays_as_it_is():
 def test_rows_of_the_program_are_what_the_flatness_map_gives():
     shape = Shape(30, False)
     problem, segment = problem_of(shape), segment_of(shape)
-    attempt = solve(problem, problem.coefficients, COLD_START)
+    attempt = solve(problem, problem.coefficients, FROM_GUESS)
     trajectory = Trajectory(PATH, segment.profile(attempt.coefficients), HARDWARE.airframe)
     layout = problem.layout
     state = trajectory.at(trajectory.time_at(layout.s * problem.step))
@@ -124,65 +128,44 @@ def test_rows_of_the_program_are_what_the_flatness_map_gives():
         np.testing.assert_allclose(attempt.rows[which, there], expected[there], atol=1e-6)
 
 
-def test_compiled_code_and_virtual_machine_find_the_same_flight():
-    problem = problem_of(Shape(31, False, turning_limited=True))
-    compiled, interpreted = (SplineProgram(problem, kernels) for kernels in (CompiledKernels, InterpretedKernels))
-    found = [minimise(each, each.v_of(problem.coefficients), Search()) for each in (compiled, interpreted)]
-    assert found[0].solved
-    assert found[1].solved
-    np.testing.assert_allclose(found[0].v, found[1].v, rtol=1e-6)
-
-
 @pytest.mark.parametrize("turned", [-40.0, -3.2, 0.0, 0.8, 1.6, 3.1, 4.7, 900.0])
 @pytest.mark.parametrize("free_yaw", [False, True])
-def test_compiled_code_and_virtual_machine_agree_at_each_point_whichever_way_it_looks(free_yaw, turned):
+def test_compiled_code_computes_what_casadi_does_at_each_point_whichever_way_it_looks(free_yaw, turned):
     problem = problem_of(Shape(24, free_yaw, turning_limited=True))
     problem.point_data[14] += turned
     problem.coefficients[:, 1:] += turned
-    results = []
-    for kernels in (CompiledKernels, InterpretedKernels):
-        program = SplineProgram(problem, kernels)
-        v = program.v_of(problem.coefficients)
-        values = program.evaluate(v)
-        terms = np.random.default_rng(1).uniform(0.0, 1.0, (4, len(values.constraints)))
-        near = program.linearise(v, terms)
-        along = near.jvp(np.random.default_rng(2).normal(size=len(v)))
-        results.append([np.array(values.cost), values.constraints, near.gradients, near.matrix, along])
-    for one, other in zip(*results, strict=True):
+    layout, weights = problem.layout, problem.penalties
+    kernels = Kernels(free_yaw, problem.point_data, problem.common, weights, spare=0)
+    for k in range(len(kernels.coefficients)):
+        kernels.coefficients[k] = problem.coefficients[layout.interval + k % 4, k // 4]
+    terms = np.random.default_rng(1).uniform(0.0, 1.0, (4, ROWS * len(layout.interval)))
+    found = [*kernels.evaluate(), kernels.differentiate(terms), kernels.work]
+
+    values, derivatives_at = (each.map(len(layout.interval)) for each in point_kernels(free_yaw))
+    given = kernels.coefficients, problem.point_data, *(
+        np.tile(each[:, None], len(layout.interval)) for each in (problem.common, weights)
+    )  # fmt: skip
+    rows, penalties = values(*given)
+    jacobian, gradients, hessian = derivatives_at(*given, *terms.reshape(4, ROWS, -1))
+    expected = [rows.full().ravel(), penalties.full()[0], jacobian.full(), casadi.vertcat(gradients, hessian).full()]
+    for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * abs(other).max())
 
 
-@pytest.fixture
-def other_cache(monkeypatch, tmp_path):
-    """Compiles kernels anew, for a cache folder of the test's choice."""
-    monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
-    kernel.machine_code.cache_clear()
-    yield tmp_path
-    kernel.machine_code.cache_clear()
-
-
-def test_kernels_compile_where_the_cache_folder_cannot_be_written(monkeypatch, other_cache):
-    (other_cache / "file").write_text("")
-    monkeypatch.setenv("CFPLAN_CACHE", str(other_cache / "file" / "below"))
-    assert set(kernel.machine_code()) == {"given_values", "given_derivatives", "free_values", "free_derivatives"}
-
-
-def test_kernels_are_compiled_once_and_left_alone(other_cache):
-    kernel.machine_code()
-    (made,) = other_cache.glob("kernels-*")
-    before = made.stat().st_mtime_ns
-    kernel.machine_code.cache_clear()
-    kernel.machine_code()
-    assert made.stat().st_mtime_ns == before
-    assert {entry.name for entry in other_cache.iterdir()} == {made.name, "locks"}  # nothing half-made beside it
-
-
-def test_an_instruction_that_cannot_be_written_out_is_named(monkeypatch):
+def test_an_instruction_that_cannot_be_compiled_is_named():
     x = casadi.SX.sym("x")
     unknown = casadi.Function("unknown", [x], [casadi.atan(x)])
-    monkeypatch.setattr(derivatives, "point_kernels", lambda free_yaw: (unknown, unknown))
+
+    @intrinsic
+    def evaluate(_context, first, points, inputs, results):
+        return types.void(first, points, inputs, results), generator(unknown, (), 1)
+
+    @njit
+    def run(inputs, results):
+        evaluate(0, 1, inputs, results)
+
     with pytest.raises(NotImplementedError, match="unknown: instruction"):
-        kernel.source()
+        run((np.ones(1),), (np.ones(1),))
 
 
 def test_an_answer_that_is_not_a_flight_is_not_believed(monkeypatch):
@@ -208,11 +191,9 @@ def test_limits_are_lowered_only_around_what_exceeds_them():
 
 
 def test_many_more_nodes_need_no_other_library():
-    before = kernel.machine_code()
     solution = plan_expert(PlanningTask(PATH, HARDWARE.airframe, HARDWARE.limits, nodes=400))
     assert solution.status is Status.SOLVED
     assert certify(Trajectory(PATH, solution.profile, HARDWARE.airframe), HARDWARE.limits).passed
-    assert kernel.machine_code() == before
 
 
 def test_a_guess_between_two_states_has_both_to_the_last_bit_and_does_not_jerk():

@@ -82,7 +82,7 @@ def test_a_search_that_takes_whole_steps_at_their_word_saves_looking_and_ends_as
     near = Search(barrier=1e-3, last_barrier=1e-3, gradient=1e-3, feasibility=1e-3, iterations=300)
     first, second = Looks(8, -np.inf, 0.5), Looks(8, -np.inf, 0.5)
     looked = minimise(first, start, near)
-    believed = minimise(second, start, replace(near, left_by_step=1e-3))
+    believed = minimise(second, start, replace(near, predicted_gradient_factor=1e-3))
     assert looked.solved
     assert believed.solved
     assert second.count < first.count
