@@ -4,15 +4,14 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
-
 from cfplan.cli.output import Steps
+from cfplan.errors import InputError
 
 
 def warm_up(safety_file: Path, steps: Steps) -> None:
     """Fly each part of the small flight in a process of its own, and then all of it, as a step of a command.
 
-    Does nothing if that was done, or if compiled code cannot be kept. Raises ClickException if a part fails.
+    Does nothing if that was done, or if compiled code cannot be kept. Raises InputError if a part fails.
     """
     from cfplan.machine_code import cache_writable, code_folder, count_functions, delete_unused
 
@@ -37,7 +36,10 @@ def _run_side_by_side(safety_file: Path) -> None:
         for process in processes:
             _, errors = process.communicate()
             if process.returncode:
-                raise click.ClickException(f"compiling failed: {errors.strip().splitlines()[-1:]}")
+                last = (errors.strip().splitlines() or ["no message"])[-1]
+                raise InputError(
+                    f"compiling failed: {last}", where=str(safety_file), hint="check it by `cfplan doctor`"
+                )
     finally:
         for process in processes:
             process.kill()

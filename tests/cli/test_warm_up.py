@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import click
 import pytest
 
 from cfplan.cli.output import Steps
 from cfplan.cli.warm_up import warm_up
+from cfplan.errors import InputError
 from cfplan.machine_code import code_folder
 
 ROOT = Path(__file__).parent.parent.parent
@@ -64,7 +64,7 @@ def test_after_compiling_ahead_nothing_is_compiled(tmp_path):
 @pytest.mark.integration
 def test_a_part_that_fails_to_compile_is_reported(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("CFPLAN_CACHE", str(tmp_path))
-    with pytest.raises(click.ClickException, match=r"compiling failed.*no-such-file"):
+    with pytest.raises(InputError, match=r"compiling failed.*no-such-file"):
         warm_up(tmp_path / "no-such-file.yaml", Steps(as_json=False))
     assert "machine code" in capsys.readouterr().out
     assert not (code_folder() / "ready").exists()
