@@ -31,6 +31,7 @@ class Body(NamedTuple):
     arm: Scalar
     thrust_to_torque: Scalar
     drag: tuple[Scalar, Scalar]
+    velocity_moment: tuple[Scalar, Scalar]
 
 
 class Flat(NamedTuple):
@@ -44,7 +45,7 @@ class Flat(NamedTuple):
     thrust_axis: Vector  # b₃, unit
     body_rate: Vector  # rad/s, body axes
     angular_acceleration: Vector  # rad/s², body axes
-    torque: Vector  # N m
+    torque: Vector  # N m, of the motors
     motor_thrust: tuple[Scalar, Scalar, Scalar, Scalar]  # N
 
 
@@ -134,10 +135,16 @@ def flat_state(
         (b * a2 - a * b2) * lift - (b * a1 - a * b1) * c1 * lift * lift + psi_ddt,
     )
 
+    # The air turns the body in proportion to its velocity along x and y; before the turn by yaw these are
+    first = velocity[0] - a * (velocity[2] + lift * (a * velocity[0] + b * velocity[1]))
+    second = velocity[1] - b * (velocity[2] + lift * (a * velocity[0] + b * velocity[1]))
+    along, across = cos_psi * first + sin_psi * second, cos_psi * second - sin_psi * first
+    about_x, about_y = airframe.velocity_moment
+
     jx, jy, jz = airframe.inertia
     torque = (
-        jx * angular_acceleration[0] + (jz - jy) * wy * wz,
-        jy * angular_acceleration[1] + (jx - jz) * wz * wx,
+        jx * angular_acceleration[0] + (jz - jy) * wy * wz - about_x * across,
+        jy * angular_acceleration[1] + (jx - jz) * wz * wx + about_y * along,
         jz * angular_acceleration[2] + (jy - jx) * wx * wy,
     )
     motor_thrust = motor_thrusts(airframe, airframe.mass * specific_thrust, torque)
@@ -167,8 +174,8 @@ def motor_thrusts(
 
 def compiled_body(airframe: Airframe) -> Body:
     """Return the airframe for compiled code, which takes floats alone."""
-    (jx, jy, jz), (planar, axial) = airframe.inertia, airframe.drag
+    (jx, jy, jz), (planar, axial), (about_x, about_y) = airframe.inertia, airframe.drag, airframe.velocity_moment
     return Body(
         float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),
-        float(airframe.thrust_to_torque), (float(planar), float(axial)),
+        float(airframe.thrust_to_torque), (float(planar), float(axial)), (float(about_x), float(about_y)),
     )  # fmt: skip

@@ -69,11 +69,16 @@ def test_thrust_weight_and_rotor_drag_accelerate_the_mass(trajectory, inner_time
     np.testing.assert_allclose(force / airframe.mass, state.acceleration, atol=1e-12)
 
 
-def test_motor_thrusts_give_the_thrust_and_the_torque_of_eulers_equation(trajectory, inner_times):
-    state, airframe = trajectory.at(inner_times), trajectory.airframe
+@pytest.mark.parametrize("moment", [(0.0, 0.0), (4.5e-4, 6.2e-4)], ids=["still air", "air that turns it"])
+def test_motor_thrusts_give_the_thrust_and_the_torque_of_eulers_equation(trajectory, inner_times, moment):
+    """Less the moment of the air, in proportion to the velocity along the body's axes."""
+    airframe = replace(trajectory.airframe, velocity_moment=moment)
+    state = Trajectory(trajectory.path, trajectory.profile, airframe).at(inner_times)
     inertia = np.array(airframe.inertia)
     torque = inertia * state.angular_acceleration + np.cross(state.body_rate, inertia * state.body_rate)
-    wrench = np.column_stack([airframe.mass * state.specific_thrust, torque])
+    along = Rotation.from_quat(state.quaternion).apply(state.velocity, inverse=True)
+    air = np.column_stack([moment[0] * along[:, 1], -moment[1] * along[:, 0], np.zeros(len(along))])
+    wrench = np.column_stack([airframe.mass * state.specific_thrust, torque - air])
     np.testing.assert_allclose(state.motor_thrust @ airframe.mixing.T, wrench, atol=1e-15)
 
 

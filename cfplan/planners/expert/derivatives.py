@@ -37,13 +37,14 @@ def point_expressions(free_yaw: bool) -> tuple[list[casadi.SX], casadi.SX, casad
     weights = casadi.SX.sym("weights", 3)
 
     values: list[Any] = casadi.vertsplit(common)
-    (mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, scale), limits = values[:9], values[9:]
+    mass, jx, jy, jz, arm, thrust_to_torque, drag, axial_drag, about_x, about_y, scale = values[:11]
+    limits = values[11:]
     data: list[Any] = casadi.vertsplit(point)
     derivatives: Any = tuple(tuple(data[3 * k : 3 * k + 3]) for k in range(4))
     local: list[Any] = casadi.vertsplit(z)
     x, yaw = [casadi.fmax(local[0], LEAST), *local[1:4]], local[4:] if free_yaw else data[YAW:]
     h: Any = tuple(scale * value for value in x)
-    body = Body(mass, (jx, jy, jz), arm, thrust_to_torque, (drag, axial_drag))
+    body = Body(mass, (jx, jy, jz), arm, thrust_to_torque, (drag, axial_drag), (about_x, about_y))
     measured = measures.measures(flat_state(body, derivatives, h, tuple(yaw), casadi.cos, casadi.sin))
     rows: list[Any] = quantities.rows_of(measured, limits[: len(measured)], limits[len(measured) :])[:ROWS]
 

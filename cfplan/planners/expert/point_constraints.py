@@ -16,7 +16,7 @@ ROWS = measures.SPEED  # all measures before it
 LOWER, UPPER, JUMPS = quantities.LOWER[:ROWS], quantities.UPPER[:ROWS], quantities.JUMPS[:ROWS]
 
 POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
-COMMON_DATA = 9 + 2 * measures.MEASURES  # the airframe (8), scale; offset and scale of each row of the table
+COMMON_DATA = 11 + 2 * measures.MEASURES  # the airframe (10), scale; offset and scale of each row of the table
 PLACE, WEIGHT, YAW = 12, 13, 14  # rows of the point data
 LANES = 8  # points come in multiples of this, which the kernels may take with one instruction
 LEAST = 1e-6  # x below this counts as this: a solver that tries h < 0 must not meet what is not a number
@@ -27,7 +27,8 @@ def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray
     """Return (COMMON_DATA,), the same at every point; `scale` turns x into h in node units."""
     offsets, scales = quantities.scales(limits)
     return np.concatenate([
-        [airframe.mass, *airframe.inertia, airframe.arm, airframe.thrust_to_torque, *airframe.drag, scale],
+        [airframe.mass, *airframe.inertia, airframe.arm, airframe.thrust_to_torque, *airframe.drag],
+        [*airframe.velocity_moment, scale],
         offsets, np.minimum(scales, UNBOUNDED),
     ])  # fmt: skip
 
