@@ -43,6 +43,7 @@ ROOM = 0.005  # fraction of each limit that plans leave to the plan that continu
 BETWEEN = 0.6  # of that, which limits may use up between points: so much less is done to the plan
 SEARCH_TIMEOUT = 2.0  # s, of a vehicle that rests
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
+_OTHERS = "give other waypoints"
 COARSER = 0.85  # fraction of the usual intervals: such plans take 0.05 % longer, and nine tenths of the time to make
 
 
@@ -126,9 +127,7 @@ def plan_from_rest(
             speed_factor=min(speed / limits.plan.speed, 1.0),
         )  # fmt: skip
         return Continuation(planned, tuple(found.breaks[found.waypoint[1:]].tolist()))
-    raise NoWayError(
-        f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint="give other waypoints"
-    )
+    raise NoWayError(f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint=_OTHERS)
 
 
 def check_waypoints(points: NDArray, limits: Limits) -> None:
@@ -212,13 +211,13 @@ def _plan(task: PlanningTask, limits: Limits, caps: SpeedCaps | None, factor: fl
     solution = plan_early(task, BETWEEN * ROOM) if task.limits is not limits.plan else plan_early(task)
     if solution.profile is None:
         reason = f" ({' '.join(solution.reason.split())})" if solution.reason else ""
-        raise InfeasibleError(f"{solution.status}{reason}")
+        raise InfeasibleError(f"{solution.status}{reason}", hint=_OTHERS)
     profile = solution.profile if factor == 1.0 else solution.profile.slowed(factor)
     trajectory = Trajectory(task.path, profile, task.airframe)
     certificate = certify(trajectory, limits.plan, limits.space, caps)
     if not certificate.passed:
         excess = f"{certificate.worst.share - 1.0:.2%}"
-        raise NotCertifiedError(f"the plan exceeds the limit on {certificate.worst.name} by {excess}")
+        raise NotCertifiedError(f"the plan exceeds the limit on {certificate.worst.name} by {excess}", hint=_OTHERS)
     return Plan(
         path=task.path,
         airframe=task.airframe,

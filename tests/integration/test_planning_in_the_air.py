@@ -23,6 +23,7 @@ from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import DURATION
 from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
+from cfplan.planning.continuation import with_room
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
 from cfplan.simulation.lab.stepped_lab import SteppedLab
@@ -84,8 +85,10 @@ class Planner:
 
 @pytest.fixture(scope="module")
 def held(limits):
+    """A plan with as much room to its limits as plans in the air have."""
     path = min_snap(WAYPOINTS, times=centripetal_times(WAYPOINTS))
-    return hold(plan(path, limits.airframe, limits, planner="expert"), WAYPOINTS)
+    roomy = replace(limits, plan=with_room(limits.plan, limits.airframe))
+    return hold(plan(path, limits.airframe, roomy, planner="expert"), WAYPOINTS)
 
 
 @pytest.fixture(scope="module")
