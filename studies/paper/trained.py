@@ -98,7 +98,7 @@ TRAINING_COLUMNS = (
            value=lambda rows: len({row.training["seed"] for row in rows if row.training["flat"]})),
     _of_training("seconds", "training", "s", ".0f", meaning="of the processor, one thread"),
 )  # fmt: skip
-PARAMETERS = _of_training("parameters", "parameters")
+PARAMETERS = _of_training("parameters", "parameters", spec=".0f")
 
 
 class PaperPath(NamedTuple):
