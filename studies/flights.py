@@ -202,7 +202,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
             speed_factor=plan.repair_speed_factor,
             worst_usage=plan.certificate.worst.share,
             dry_run=rehearse(planned, encoded).deviation,
-            dry_run_without_drag=dry_run(bare, plan.trajectory, plan.airframe, plan.limits.flight).deviation,
+            dry_run_without_drag=dry_run(bare, plan.trajectory, planned.limits).deviation,
             motor_lag=plan.airframe.motor_time_constant,
         )
         return Prepared(row, mission_of(encoded, planned.limits), plan.trajectory)
