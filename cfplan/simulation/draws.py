@@ -14,7 +14,8 @@ from cfplan.safety.limits import PoseLimits
 from cfplan.vehicle.airframe import Airframe
 
 DRAWS = 32
-POSE_AGE = (0.002, 0.008)  # s, of a position that the pilot has carried on to when it is sent; public logs: 3 to 8 ms
+RADIO = 0.002  # s, from the pilot to the vehicle
+LATENCY_ERROR = 0.003  # s, by which the room's latency may be stated too low or too high
 _SEED = 45
 _HALF_WIDTH = 1.96  # standard deviations in half the width of 95 %
 
@@ -54,7 +55,6 @@ def _drawn(airframe: Airframe, pose: PoseLimits, deviations: NDArray, quantiles:
         velocity_moment=(moment * airframe.velocity_moment[0], moment * airframe.velocity_moment[1]),
         motor_time_constant=lag * airframe.motor_time_constant,
     )  # fmt: skip
-    youngest, oldest = POSE_AGE
-    # Cameras look at any moment between two of the pilot's sendings.
-    carried, waited = youngest + age * (oldest - youngest), phase / pose.rate
-    return Draw(vehicle, carried, pose.latency + waited + youngest, waited, seed)
+    # Cameras look at any moment between two of the pilot's sendings. The pilot carries a position on to when it is sent.
+    wrong, waited = (2.0 * age - 1.0) * LATENCY_ERROR, phase / pose.rate
+    return Draw(vehicle, max(RADIO + wrong, 0.0), max(pose.latency + wrong + waited, 0.0) + RADIO, waited, seed)

@@ -25,7 +25,7 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.safety.limits import FlightLimits, Limits
 from cfplan.safety.quantities import ON_LADDER
-from cfplan.simulation.draws import Draw, draw_vehicles, nominal_draw
+from cfplan.simulation.draws import RADIO, Draw, draw_vehicles, nominal_draw
 from cfplan.simulation.engine.body import TIME_STEP
 from cfplan.simulation.engine.estimated_loop import EstimatorInput, fly_with_estimator
 from cfplan.simulation.engine.flight import AS_PLANNED, ClosedLoop, Conditions, fly_setpoints
@@ -182,7 +182,7 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits) -> ClosedLoop:
         attitude_deviation=EXTERNAL_ATTITUDE_STD, drag=(drag, drag, 0.0), noise=noise,
     )  # fmt: skip
     flown = fly_with_estimator(
-        gains, flight.setpoints, flight.times, drawn, start[:13], poses,
+        gains, flight.setpoints, flight.times + RADIO, drawn, start[:13], poses,
         scale=np.full(steps, drawn.thrust_scale), mode=flight.mode,
     )  # fmt: skip
     commands = flown.asked * (FULL_COMMAND / told.motor_thrust_max)
