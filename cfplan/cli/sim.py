@@ -16,7 +16,7 @@ from cfplan.preparation.compiled_calls import Stage
 @options.planning
 @options.as_json
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
-    """Rehearse a path or a plan file: its actual setpoints on drawn vehicles, by the firmware's filter and controller."""
+    """Rehearse a path or a plan file: its setpoints on drawn vehicles, by the firmware's filter and controller."""
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compile_to=Stage.REHEARSAL)
     with steps.waiting("loading planners and simulator"):

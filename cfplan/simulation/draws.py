@@ -55,6 +55,6 @@ def _drawn(airframe: Airframe, pose: PoseLimits, deviations: NDArray, quantiles:
         velocity_moment=(moment * airframe.velocity_moment[0], moment * airframe.velocity_moment[1]),
         motor_time_constant=lag * airframe.motor_time_constant,
     )  # fmt: skip
-    # Cameras look at any moment between two of the pilot's sendings. The pilot carries a position on to when it is sent.
+    # Cameras look at any moment between two of the pilot's sendings, to which it carries positions on.
     wrong, waited = (2.0 * age - 1.0) * LATENCY_ERROR, phase / pose.rate
     return Draw(vehicle, max(RADIO + wrong, 0.0), max(pose.latency + wrong + waited, 0.0) + RADIO, waited, seed)
