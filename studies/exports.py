@@ -107,7 +107,7 @@ def measure(path_file: Path) -> list[OnBoard]:
 def _exported(path_file: Path, limits: Limits) -> OnBoard:
     exported = fit_polynomials(plan_for_polynomials(path_file, limits, FlightOptions()), Form.MEMORY)
     made, planned = exported.on_board, exported.planned
-    streamed = dry_run(encode_flight(planned), planned.plan.trajectory, limits.airframe, limits.flight)
+    streamed = dry_run(encode_flight(planned), planned.plan.trajectory, limits)
     return OnBoard(
         path_file.stem, "exports", kind=_kind(made.compressed), pieces=len(made.pieces.durations),
         bytes=len(made.memory), planned=planned.duration, duration=made.duration, slowed=made.reference.slowing - 1.0,

@@ -40,7 +40,7 @@ PLAN_COLUMNS = (
     Column("speed_factor", "speed kept", "%", ".2f", meaning="by repair, of the planner's speed"),
     Column("worst_share", "worst share", "%", ".2f", meaning="of any limit, by the certificate",
            value=largest("worst_usage")),
-    Column("dry_run", "dry run", "cm", ".1f", meaning="largest deviation"),
+    Column("dry_run", "dry run", "cm", ".1f", meaning="largest deviation, 95th percentile of drawn vehicles"),
     Column(
         "dry_run_without_drag", "dry run without drag", "cm", ".1f",
         meaning="the same where the acceleration field does not make up for drag",
@@ -108,7 +108,7 @@ class JudgedFlight:
     lower_bound: float = math.nan  # s
     speed_factor: float = math.nan  # of repair, on the planner's speed; 1: not slowed down
     worst_usage: float = math.nan  # largest usage of any limit, by the certificate
-    dry_run: float = math.nan  # m, largest deviation
+    dry_run: float = math.nan  # m, largest deviation, 95th percentile of the draws
     dry_run_without_drag: float = math.nan  # m, the same without drag compensation in the acceleration field
     motor_lag: float = math.nan  # s, the plan's
     refusals: int = 0  # earlier attempts that preflight refused only because this computer was late
@@ -202,7 +202,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
             speed_factor=plan.repair_speed_factor,
             worst_usage=plan.certificate.worst.share,
             dry_run=rehearse(planned, encoded).deviation,
-            dry_run_without_drag=dry_run(bare, plan.trajectory, plan.airframe, plan.limits.flight).deviation,
+            dry_run_without_drag=dry_run(bare, plan.trajectory, planned.limits).deviation,
             motor_lag=plan.airframe.motor_time_constant,
         )
         return Prepared(row, mission_of(encoded, planned.limits), plan.trajectory)

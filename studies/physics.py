@@ -18,8 +18,7 @@ from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
-from cfplan.safety.limits import FlightLimits
-from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.dry_run import fly_motion
 from cfplan.simulation.engine.flight import Conditions
 from cfplan.simulation.other_bodies import BodyStep, fly_on, identified_body, rotorpy_body
 from cfplan.vehicle.airframe import Airframe
@@ -88,7 +87,7 @@ def measure(path_file: Path, bodies: Sequence[OtherBody] = BODIES) -> list[Compa
     rows = []
     for body in bodies:
         try:
-            rows.append(compared(path_file.stem, body, encoded, trajectory, airframe, limits.flight))
+            rows.append(compared(path_file.stem, body, encoded, trajectory, airframe))
         except InputError as error:
             rows.append(ComparedFlight(path_file.stem, body.name, reason=error.what))
     if all(row.reason for row in rows):
@@ -98,8 +97,7 @@ def measure(path_file: Path, bodies: Sequence[OtherBody] = BODIES) -> list[Compa
 
 
 def compared(
-    path: str, body: OtherBody, encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe,
-    limits: FlightLimits,
+    path: str, body: OtherBody, encoded: EncodedFlight, trajectory: Trajectory, airframe: Airframe
 ) -> ComparedFlight:  # fmt: skip
     """Compare how a body and cfplan's own follow setpoints; the controller assumes `airframe`.
 
@@ -107,7 +105,7 @@ def compared(
     """
     own_body = body.beside(airframe)
     times, theirs = fly_on(body.make(airframe), encoded, trajectory, airframe)
-    loop = dry_run(encoded, trajectory, own_body, limits, conditions=Conditions(gains_for(airframe))).loop
+    loop = fly_motion(encoded, trajectory, own_body, conditions=Conditions(gains_for(airframe)))
     own = loop.position[np.minimum(np.searchsorted(loop.time, times - 1e-9), len(loop.time) - 1)]
     wanted, apart = trajectory.at(times).position, np.linalg.norm(theirs - own, axis=1)
     return ComparedFlight(

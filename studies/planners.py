@@ -36,7 +36,7 @@ from cfplan.safety.limit_sets import BOXES, LIMIT_SETS, LimitSet
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.safety.space import Space
-from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.dry_run import rehearse_motion
 from cfplan.simulation.geometric_flight import LOST
 from cfplan.vehicle.trajectory import Trajectory
 from cfplan.version import REPOSITORY
@@ -339,7 +339,7 @@ def _rehearsed(trial: Trial, trajectory: Trajectory | None, chosen: LimitSet) ->
     except NotCertifiedError as error:  # a place too far out for a packet
         return replace(trial, bytes_refused=str(error))
     seconds = time.process_time() - begun
-    run = dry_run(encoded, trajectory, chosen.airframe, lost_alone())
+    run = rehearse_motion(encoded, trajectory, chosen.airframe, lost_alone())
     return replace(trial, encode_seconds=seconds, deviation=run.deviation, dry_run=run.reason)
 
 

@@ -44,7 +44,7 @@ def test_plans_are_made_saved_read_and_rehearsed(folder, capsys):
         exec(block, names)
     said = capsys.readouterr().out
     assert "certified: True" in said
-    assert "cm beside the plan at most" in said
+    assert "cm in 95 %" in said
     assert (folder / "mine.parquet").is_file()
     assert (folder / "mine.pdf").read_bytes().startswith(b"%PDF")
 

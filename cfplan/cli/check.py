@@ -22,7 +22,8 @@ Examples:
 @options.planning
 @options.as_json
 def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> int:
-    """Check every limit along the plan of a path or of a plan file, and the setpoint packets that would fly it.
+    """Check every limit along the plan of a path or of a plan file and the setpoint packets that would fly it, and make
+    their dry run: the deviation to expect.
 
     For a record's folder: certify again everything that was committed in that flight, under the limits in the record,
     and check that the setpoints sent are those committed. Exit code 4 if a limit is exceeded or a setpoint differs.
@@ -36,16 +37,18 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
         from cfplan.preparation.plan_flight import plan_flight
 
     planned = plan_flight(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
-    if as_json:
-        print_json(planned.to_dict())
-    else:
+    if not as_json:
         print_certificate(planned.plan.certificate)
     if not planned.plan.certificate.passed:
+        if as_json:
+            print_json(planned.to_dict())
         return int(ExitCode.NOT_CERTIFIED)
 
-    from cfplan.preparation.prepare_flight import encode_flight
+    from cfplan.preparation.prepare_flight import encode_flight, rehearse
 
-    encode_flight(planned, steps)
+    rehearsed = rehearse(planned, encode_flight(planned, steps), steps)
+    if as_json:
+        print_json(planned.to_dict() | {"dry_run": rehearsed.summary()})
     return 0
 
 

@@ -137,7 +137,7 @@ def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) 
     if as_json:
         document = {"record": folder, "plan": prepared.planned.to_dict(), **summary}
         program = prepared.mission.on_board
-        print_json(document | {"dry_run_max_deviation": prepared.dry_run.deviation, "on_board": program is not None})
+        print_json(document | _expected(prepared) | {"on_board": program is not None})
     else:
         if outcome.checks and outcome.exit_code == ExitCode.PREFLIGHT:
             columns = ["check", "value", "must be", "verdict", "hint"]
@@ -154,6 +154,12 @@ def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) 
         click.echo(f"{styled('ended:', 'yellow')} {reason}", err=True)
     elif outcome.exit_code is not ExitCode.OK:
         click.echo(f"{styled('error:', 'red')} {reason}", err=True)
+
+
+def _expected(prepared: "Prepared") -> dict[str, float]:
+    """Return the largest deviation that the dry run led to expect, m."""
+    run = prepared.dry_run
+    return {"dry_run_deviation_median": run.deviation_median, "dry_run_deviation_95": run.deviation}
 
 
 def why_late(exit_code: ExitCode, summary: dict[str, Any]) -> str:
@@ -176,6 +182,6 @@ def _rows(prepared: "Prepared", flown: "RecordedFlight") -> list[tuple[str, str]
         ("ended", outcome.reason),
         *([("flown on board", f"{program.pieces} pieces, {len(program.memory)} bytes")] if program else []),
         ("preflight", f"{sum(check.passed for check in outcome.checks)} of {len(outcome.checks)} checks passed"),
-        ("deviation, dry run", f"{100 * prepared.dry_run.deviation:.1f} cm max"),
+        ("largest deviation, dry run", prepared.dry_run.expected()),
         *summary_rows(summarise(flown.record), flown.record.header.plan_limits),
     ]

@@ -15,7 +15,7 @@ from cfplan.cli.output import Steps, print_json, print_table
 @options.planning
 @options.as_json
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
-    """Rehearse a path or a plan file with its actual setpoints, the firmware's controller, drag and motor lag."""
+    """Rehearse a path or a plan file: its setpoints on drawn vehicles, by the firmware's filter and controller."""
     steps = Steps(as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners and simulator"):

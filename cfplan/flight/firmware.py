@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cfplan.vehicle.airframe import Airframe
 
 NEWEST_KNOWN = (2026, 8)  # the newest firmware that these figures were read from
+DRAG_SINCE = (2026, 4)  # the first whose filter can be told of rotor drag (kalman.dragB)
 
 
 @dataclass(frozen=True, slots=True)

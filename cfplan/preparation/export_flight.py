@@ -117,8 +117,8 @@ def fit_polynomials(
             made = certified_pieces(trajectory, limits, leads=leads, most=most)
         results.append(_describe(made, planned))
     with step(on_step, "dry run") as results:
-        run = on_board_run(made, limits.airframe, limits.flight)
-        results.append(f"deviation {100 * run.deviation:.1f} cm at most, {100 * run.deviation_rms:.1f} cm rms")
+        run = on_board_run(made, limits)
+        results.append(f"largest deviation {run.expected()}")
     if leads:
         made, run = _corrected(made, run, planned, most, room, on_step)
     run.require_passed()
@@ -157,12 +157,12 @@ def _corrected(
         except NotCertifiedError as error:
             results.append(f"none: {error.what}")
             return made, run
-        again = on_board_run(better, limits.airframe, limits.flight)
+        again = on_board_run(better, limits)
         if not again.deviation < run.deviation:
             results.append("none: the vehicle strays no less")
             return made, run
         results.append(_describe(better, planned))
-        results.append(f"deviation {100 * again.deviation:.1f} cm at most, {100 * again.deviation_rms:.1f} cm rms")
+        results.append(f"largest deviation {again.expected()}")
     return better, again
 
 

@@ -124,7 +124,7 @@ def _trial(scale: float, draw: int, path: Path, clean: Plan, planned: Callable[[
         }
         encoded = encode_trajectory(found.trajectory)
         check_bytes(encoded, found.trajectory, found.limits.plan)
-        run = dry_run(encoded, found.trajectory, found.airframe, found.limits.flight)
+        run = dry_run(encoded, found.trajectory, found.limits)
         return PerturbedPlan(**known, reason=run.reason, deviation=run.deviation)
     except CfplanError as error:
         return PerturbedPlan(**known, reason=str(error))

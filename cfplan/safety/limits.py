@@ -79,6 +79,8 @@ class PoseLimits:
     jump: float  # m, between a pose and where the last ones led, at most
     agreement: float  # m, between pose and the vehicle's own estimate, at most
     yaw_agreement: float  # rad
+    position_noise: float = 0.001  # m, standard deviation along each axis
+    attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,6 +133,8 @@ class _Pose(_Section):
     jump: Annotated[float, Field(gt=0.0, le=1.0)]
     agreement: Annotated[float, Field(gt=0.0, le=1.0)]
     yaw_agreement_deg: Annotated[float, Field(gt=0.0, le=90.0)]
+    position_noise: Annotated[float, Field(gt=0.0, le=0.1)]
+    attitude_noise_deg: Annotated[float, Field(gt=0.0, le=10.0)]
 
 
 class _LinkLoss(_Section):
@@ -266,7 +268,9 @@ def load_limits(file: Path | str) -> Limits:
     _check_order(content, places)
     airframe = _vehicle(content.vehicle, Path(file).parent, places)
     pose = content.pose.model_dump()
-    yaw_agreement = math.radians(pose.pop("yaw_agreement_deg"))
+    yaw_agreement, attitude_noise = (
+        math.radians(pose.pop(f"{name}_deg")) for name in ("yaw_agreement", "attitude_noise")
+    )
     limits = Limits(
         vehicle=content.vehicle,
         airframe=airframe,
@@ -274,7 +278,7 @@ def load_limits(file: Path | str) -> Limits:
         flight=_made(FlightLimits, content.flight, stop_tilt=math.radians(content.flight.stop_tilt_deg)),
         space=_space(content.space),
         battery=_made(BatteryLimits, content.battery),
-        pose=PoseLimits(**pose, yaw_agreement=yaw_agreement),
+        pose=PoseLimits(**pose, yaw_agreement=yaw_agreement, attitude_noise=attitude_noise),
         firmware=_made(
             FirmwareSettings,
             content.firmware,

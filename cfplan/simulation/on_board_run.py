@@ -1,34 +1,33 @@
 """Dry run of on-board pieces: polynomials flown by the simulated vehicle as its high-level commander flies them.
 
 It starts in hover where they begin. The commander evaluates them 100 times a second, as it decodes them, and hands the
-controller position, velocity, acceleration, yaw and body rates; the controller sees the true state.
+controller position, velocity, acceleration, yaw and body rates. Otherwise it is the dry run of streamed setpoints.
 """
-
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
 from cfplan.flight.on_board.pieces import RATE, Pieces, goals_at
-from cfplan.safety.limits import FlightLimits
-from cfplan.simulation.dry_run import SETTLING, DryRun, fly_and_judge
-from cfplan.simulation.engine.flight import Conditions, fly_setpoints
-from cfplan.simulation.engine.layout import SETPOINT_SIZE, hovering
-from cfplan.vehicle.airframe import Airframe
+from cfplan.safety.limits import Limits
+from cfplan.simulation.dry_run import SETTLING, DryRun, Rehearsed, rehearse_draws
+from cfplan.simulation.engine.layout import SETPOINT_SIZE
+from cfplan.simulation.engine.mellinger import ON_BOARD
 
 
-def on_board_run(flight: OnBoardTrajectory, airframe: Airframe, limits: FlightLimits) -> DryRun:
+def on_board_run(flight: OnBoardTrajectory, limits: Limits) -> DryRun:
     """Fly the pieces, and hover for SETTLING s behind them; deviations are from the plan, slowed as they are."""
     pieces = flight.pieces
     times = np.arange(int(np.ceil((pieces.duration + SETTLING) * RATE))) / RATE
     rows = goal_rows(pieces, times)
-    start = hovering(airframe, rows[0, :3], float(rows[0, 18]))
 
-    conditions = Conditions(on_board=True)
-    fly = partial(fly_setpoints, rows, times, airframe, start, conditions=conditions)
+    def wanted_at(times: NDArray) -> NDArray:
+        return flight.reference.plan_at(times)[:, 0, :3]
+
     duration = pieces.duration + SETTLING
-    return fly_and_judge(fly, duration, lambda at: flight.reference.plan_at(at)[:, 0, :3], pieces.duration, limits)
+    return rehearse_draws(
+        Rehearsed(rows, times, float(rows[0, 18]), wanted_at, pieces.duration, duration, ON_BOARD), limits
+    )  # fmt: skip
 
 
 def goal_rows(pieces: Pieces, times: NDArray) -> NDArray:

@@ -20,7 +20,7 @@ from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.repair import refine, repair
 from cfplan.safety.limit_sets import LIMIT_SETS
-from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.dry_run import rehearse_motion
 from cfplan.simulation.geometric_flight import LOST, thrust_violation
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.networks import Kind
@@ -127,7 +127,7 @@ def _shipped(trial: PaperTrial, path: Path) -> PaperTrial:
         trial = replace(trial, travel_time=trajectory.duration, violation=_planned_violation(trajectory))
         encoded = encode_trajectory(trajectory)
         check_bytes(encoded, trajectory, limits)
-        run = dry_run(encoded, trajectory, airframe, lost_alone())
+        run = rehearse_motion(encoded, trajectory, airframe, lost_alone())
         return replace(trial, reason=run.reason, deviation=run.deviation)
     except CfplanError as error:
         return replace(trial, reason=str(error))

@@ -44,7 +44,6 @@ from studies.paper.trials import (
     shipped_profile,
 )
 from studies.physics import BODIES, OtherBody, compared
-from studies.runner.limits import lost_alone
 from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table
@@ -179,7 +178,7 @@ def _largest(errors: NDArray) -> float:
 
 
 def _by_bytes(encoded: EncodedFlight, trajectory: Trajectory, begun: BodyFlight, body: OtherBody) -> BodyFlight:
-    found = compared(begun.path, body, encoded, trajectory, trajectory.airframe, lost_alone())
+    found = compared(begun.path, body, encoded, trajectory, trajectory.airframe)
     return replace(begun, deviation=found.deviation, own_deviation=found.own_deviation, apart=found.apart)
 
 

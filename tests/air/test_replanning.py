@@ -19,7 +19,7 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.continuation import with_room
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
-from cfplan.simulation.dry_run import dry_run, rehearse_setpoints
+from cfplan.simulation.dry_run import fly_motion, rehearse_motion, rehearse_setpoints
 from cfplan.simulation.glitches import glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
 
@@ -61,12 +61,10 @@ def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits)
         glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation, gaps.deviation[:, begin:]
     )
     flown, later = held.motion, held.motion.since(begin / RATE)
-    at_once = dry_run(encode_trajectory(flown, space=limits.space), flown, limits.airframe, limits.flight)
-    gone_on = dry_run(
-        encode_trajectory(later, space=limits.space), later, limits.airframe, limits.flight, snapshot=believed
-    )
+    at_once = fly_motion(encode_trajectory(flown, space=limits.space), flown, limits.airframe)
+    gone_on = fly_motion(encode_trajectory(later, space=limits.space), later, limits.airframe, snapshot=believed)
     rows = slice(begin * 10, begin * 10 + 2000)
-    np.testing.assert_allclose(gone_on.loop.position[:2000], at_once.loop.position[rows], atol=1e-5)
+    np.testing.assert_allclose(gone_on.position[:2000], at_once.position[rows], atol=1e-5)
 
 
 def test_new_waypoints_replace_those_ahead(held, limits):
@@ -164,7 +162,7 @@ def test_a_flight_replanned_again_and_again_keeps_every_limit_in_what_was_sent(h
     places = joined.at(np.arange(len(sent)) / RATE + LEAD).position
     np.testing.assert_allclose(decode(np.array(sent)).position, places, atol=5.1e-4)
     as_sent = replace(whole, payloads=np.array(sent), decoded=decode(np.array(sent)))
-    assert dry_run(as_sent, joined, limits.airframe, limits.flight).passed
+    assert rehearse_motion(as_sent, joined, limits.airframe, limits.flight).passed
     assert len(held.motion.trajectories) < len(joined.trajectories)  # what is behind is forgotten
 
 

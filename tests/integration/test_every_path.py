@@ -40,7 +40,7 @@ def test_a_path_file_certifies_and_flies_as_planned(file):
     assert made.certificate.passed
     encoded = encode_trajectory(made.trajectory)
     check_bytes(encoded, made.trajectory, limits.plan)
-    assert dry_run(encoded, made.trajectory, limits.airframe, limits.flight).passed
+    assert dry_run(encoded, made.trajectory, limits).passed
 
     assert limits.airframe.motor_time_constant == 0.105
     cameras = ViconSettings(position_noise=1e-3, attitude_noise=np.radians(0.2), latency=0.010)

@@ -30,7 +30,7 @@ def test_a_path_file_flies_on_board(file):
     assert certify_pieces(decoded, limits.airframe, limits.plan, limits.space).passed
     plan = planned.plan.trajectory
     streamed = encode_trajectory(plan, gains=gains_under(limits), space=limits.space)
-    by_stream = dry_run(streamed, plan, limits.airframe, limits.flight).deviation
+    by_stream = dry_run(streamed, plan, limits).deviation
     print(
         f"{file.stem}: {len(decoded.durations)} pieces, {len(made.memory)} bytes, {made.duration:.1f} s of "
         f"{planned.duration:.1f} s, {100 * exported.dry_run.deviation:.1f} cm, {100 * by_stream:.1f} cm streamed"

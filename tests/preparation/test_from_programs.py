@@ -103,5 +103,5 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch, capsys):
         exec(snippet, names)
     printed = capsys.readouterr().out
     assert "certified: True" in printed
-    assert "cm beside the plan" in printed
+    assert "cm in 95 %" in printed
     assert "row 2" in printed

@@ -11,7 +11,7 @@ from cfplan.errors import InputError
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.dry_run import fly_motion
 from cfplan.simulation.engine.flight import NO_FLOOR
 from cfplan.simulation.engine.layout import hovering, pack_airframe
 from cfplan.simulation.other_bodies import fly_on, identified_body, rotorpy_body
@@ -45,7 +45,7 @@ def test_with_the_dry_runs_body_it_is_the_dry_runs_flight(path_file):
     planned = plan_flight(path_file, limits)
     encoded, trajectory = encode_flight(planned), planned.plan.trajectory
     times, positions = fly_on(own_step, encoded, trajectory, AIRFRAME)
-    loop = dry_run(encoded, trajectory, AIRFRAME, limits.flight).loop
+    loop = fly_motion(encoded, trajectory, AIRFRAME)
     np.testing.assert_allclose(times, loop.time[::2], atol=1e-9)
     np.testing.assert_array_equal(positions, loop.position[::2])
 

@@ -6,7 +6,8 @@ on what it believes. At each millisecond: sensors, a pose if one arrives, the fi
 the body.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +34,7 @@ from cfplan.simulation.engine.layout import (
 )
 from cfplan.simulation.engine.lee import LeeGains
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import matrix_of, yaw_of
+from cfplan.vehicle.rotations import matrix_of, product, yaw_of
 
 BELIEF_SIZE = 13
 POSE_LATENCY = 0.005  # s; public logs: 3 to 8 ms
@@ -48,10 +49,12 @@ class EstimatorInput:
 
     time: NDArray  # (M,) s, when each arrived
     latency: float = POSE_LATENCY  # s
+    attitude_latency: float | None = None  # s of its attitude, where that is another
     with_attitude: bool = True  # a single marker gives none
     position_deviation: float = 0.001  # m, as the filter is told (locSrv.extPosStdDev)
     attitude_deviation: float = 0.05  # rad (locSrv.extQuatStdDev)
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s that the filter knows (kalman.dragB)
+    noise: NDArray = field(default_factory=lambda: np.zeros((0, 6)))  # (M or 0, 6) m, and rad about the body's axes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +64,7 @@ class EstimatedFlight:
     states: NDArray  # (N, 17) as in `layout`
     beliefs: NDArray  # (N, 13) estimated position, velocity, quaternion; body rate as measured
     control: NDArray  # (N, 4) thrust N and torques N m that the controller asked for
+    asked: NDArray  # (N, 4) N, thrust that it asked of each motor
 
 
 class _Loop(NamedTuple):
@@ -69,6 +73,7 @@ class _Loop(NamedTuple):
     states: NDArray
     beliefs: NDArray
     control: NDArray
+    asked: NDArray
     setpoints: NDArray  # (K, 14 or 20) as the controller takes them
     changes: NDArray  # (K,) ms at which each comes into force
     mode: mellinger.Modes  # (7,) of Mellinger's
@@ -77,7 +82,8 @@ class _Loop(NamedTuple):
     levers: NDArray  # (5,) arm m, yaw torque per thrust m, most thrust of a motor N, N per 16-bit unit, by Mellinger
     scale: NDArray  # (N,) the body's thrust scale, which falls with the battery
     arrivals: NDArray  # (M,) ms of each pose
-    pose: NDArray  # (4,) latency ms, with attitude, standard deviations m and rad
+    noise: NDArray  # (M or 0, 6) m and rad, of each pose
+    pose: NDArray  # (5,) latencies of position and attitude ms, with attitude, standard deviations m and rad
     kalman: Filter
     prior: NDArray
     lowpass: NDArray  # (2, 5) of gyroscope and accelerometer
@@ -113,13 +119,16 @@ def fly_with_estimator(
     most = airframe.motor_thrust_max
     per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
     prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
+    attitude_latency = poses.latency if poses.attitude_latency is None else poses.attitude_latency
     pose = np.array([
-        round(poses.latency / TIME_STEP), poses.with_attitude, poses.position_deviation, poses.attitude_deviation
+        round(poses.latency / TIME_STEP), round(attitude_latency / TIME_STEP), poses.with_attitude,
+        poses.position_deviation, poses.attitude_deviation,
     ])  # fmt: skip
     loop = _Loop(
         states=states,
         beliefs=beliefs,
         control=np.zeros((steps, 4)),
+        asked=np.zeros((steps, 4)),
         setpoints=np.ascontiguousarray(setpoints, dtype=float),
         changes=np.round(times / TIME_STEP).astype(np.int64),
         mode=mode,
@@ -128,13 +137,14 @@ def fly_with_estimator(
         levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
         scale=np.asarray(scale, dtype=float),
         arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
+        noise=np.ascontiguousarray(poses.noise, dtype=float),
         pose=pose,
         kalman=_settled(start, pose, prior),
         prior=prior,
         lowpass=np.stack([_lowpass(GYRO_CUTOFF), _lowpass(ACCELEROMETER_CUTOFF)]),
     )
     _run(loop, estimator)
-    return EstimatedFlight(states, beliefs, loop.control)
+    return EstimatedFlight(states, beliefs, loop.control, loop.asked)
 
 
 def _lowpass(cutoff: float) -> NDArray:
@@ -145,15 +155,21 @@ def _lowpass(cutoff: float) -> NDArray:
 
 def _settled(start: NDArray, pose: NDArray, prior: NDArray) -> Filter:
     """Return a filter whose covariance has settled in hover, and which believes `start`."""
-    kalman = new_filter(prior)
-    row = np.zeros((1, 9))
-    half = 0.5 * yaw_of(start[6:10])
-    level = np.array([0.0, 0.0, np.sin(half), np.cos(half)])
-    row[0, :3], row[0, 3:7], row[0, 7:] = start[:3], level * pose[1], pose[2:]
-    kalman.state[:3], kalman.quaternion[:] = start[:3], level
-    _settle(kalman, prior, row)
+    kalman = Filter(*(part.copy() for part in _hovered(yaw_of(start[6:10]), tuple(pose[2:]), tuple(prior))))
     kalman.state[:3], kalman.state[3:6] = start[:3], matrix_of(start[6:10]).T @ start[3:6]
     kalman.quaternion[:] = start[6:10]
+    return kalman
+
+
+@lru_cache(maxsize=16)
+def _hovered(yaw: float, pose: tuple[float, ...], prior: tuple[float, ...]) -> Filter:
+    """Return a filter after _SETTLING ms of hover at the origin; not to be changed. `pose` is without latencies."""
+    packed = np.array(prior)
+    kalman, row = new_filter(packed), np.zeros((1, 9))
+    level = np.array([0.0, 0.0, np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
+    row[0, 3:7], row[0, 7:] = level * pose[0], pose[1:]
+    kalman.state[:3], kalman.quaternion[:] = 0.0, level
+    _settle(kalman, packed, row)
     return kalman
 
 
@@ -164,7 +180,7 @@ def _settle(kalman: Filter, prior: NDArray, row: NDArray) -> None:
         step_filter(kalman, prior, still, hover, row if tick % _POSE_PERIOD == 0 else row[:0], tick, True)
 
 
-@njit
+@njit(nogil=True)
 def _run(loop: _Loop, estimator: bool) -> None:
     vehicle, belief, control = loop.vehicle, loop.beliefs[0].copy(), np.zeros(4)
     state = vehicle[:STATE_SIZE]
@@ -183,7 +199,9 @@ def _run(loop: _Loop, estimator: bool) -> None:
         _filter(loop.lowpass[1], past[1], forces, acceleration)
         count = 0
         if arrived < len(loop.arrivals) and loop.arrivals[arrived] <= step:
-            _write_pose(row, loop, max(loop.arrivals[arrived] - int(loop.pose[0]), 0))
+            _write_pose(row, loop, loop.arrivals[arrived])
+            if len(loop.noise) > 0:
+                _disturb(row, loop.noise[arrived])
             arrived, count = arrived + 1, 1
         if estimator:
             step_filter(loop.kalman, loop.prior, gyro, acceleration, row[:count], step, True)
@@ -196,7 +214,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
             newest += 1
         if step % 2 == 0:
             _control(loop, loop.setpoints[newest], belief, control)
-        loop.control[step] = control
+        loop.control[step], loop.asked[step] = control, vehicle[ASKED : ASKED + 4]
         vehicle[THRUST_SCALE] = loop.scale[step]
         step_and_feel(vehicle, TIME_STEP, forces)
 
@@ -220,12 +238,26 @@ def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) 
 
 
 @register_jitable
-def _write_pose(row: NDArray, loop: _Loop, seen: int) -> None:
-    for k in range(7):
-        row[0, k] = loop.states[seen, k if k < 3 else 3 + k]
-    for k in range(3, 7):
-        row[0, k] *= loop.pose[1]
-    row[0, 7], row[0, 8] = loop.pose[2], loop.pose[3]
+def _write_pose(row: NDArray, loop: _Loop, arrival: int) -> None:
+    seen, turned = max(arrival - int(loop.pose[0]), 0), max(arrival - int(loop.pose[1]), 0)
+    for k in range(3):
+        row[0, k] = loop.states[seen, k]
+    for k in range(4):
+        row[0, 3 + k] = loop.states[turned, 6 + k] * loop.pose[2]
+    row[0, 7], row[0, 8] = loop.pose[3], loop.pose[4]
+
+
+@register_jitable
+def _disturb(row: NDArray, noise: NDArray) -> None:
+    """Add noise, (6,), to a pose: m, and small angles, rad, about its axes."""
+    x, y, z, w = row[0, 3], row[0, 4], row[0, 5], row[0, 6]
+    turn = 0.5 * noise[3], 0.5 * noise[4], 0.5 * noise[5], 1.0
+    turned = product((x, y, z, w), turn)
+    size = np.sqrt(1.0 + turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    for k in range(3):
+        row[0, k] += noise[k]
+    for k in range(4):
+        row[0, 3 + k] = turned[k] / size
 
 
 @register_jitable

@@ -254,6 +254,19 @@ def _carry(covariance: NDArray, step: NDArray) -> None:
 
 
 @njit(allocates=False)
+def _carry_attitude(covariance: NDArray, step: NDArray) -> None:
+    """Propagate the covariance through a step, (9, 9), of which only the block of attitude errors is not identity."""
+    for column in range(_SIZE):
+        a, b, c = covariance[6, column], covariance[7, column], covariance[8, column]
+        for row in range(6, 9):
+            covariance[row, column] = step[row, 6] * a + step[row, 7] * b + step[row, 8] * c
+    for row in range(_SIZE):
+        a, b, c = covariance[row, 6], covariance[row, 7], covariance[row, 8]
+        for column in range(6, 9):
+            covariance[row, column] = a * step[column, 6] + b * step[column, 7] + c * step[column, 8]
+
+
+@njit(allocates=False)
 def _add_noise(kalman: Filter, prior: NDArray) -> None:
     for axis in range(3):
         acceleration = prior[_ACC_Z] if axis == 2 else prior[_ACC_XY]
@@ -319,10 +332,8 @@ def _absorb_attitude_error(kalman: Filter) -> None:
     if most > _SMALLEST_CORRECTION and most < 10.0:
         _turn_by(kalman.quaternion, x, y, z)
         step = np.zeros((_SIZE, _SIZE))
-        for axis in range(6):
-            step[axis, axis] = 1.0
         _rotate_error(step, x / 2, y / 2, z / 2)
-        _carry(kalman.covariance, step)
+        _carry_attitude(kalman.covariance, step)
     for axis in range(3):
         kalman.state[6 + axis] = 0.0
     _bound(kalman.covariance)
