@@ -11,7 +11,7 @@ from wrong_values import wrong_on_board
 
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
-from cfplan.flight.pilot.keys import HeldOrders
+from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action
@@ -24,6 +24,7 @@ from cfplan.simulation.engine.flight import Conditions, fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.parameters import parameter_toc
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
@@ -33,6 +34,8 @@ LIMITS = load_limits(REPOSITORY / "safety.yaml")
 ZERO_ATTITUDE = pack(Port.ATTITUDE_SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
 HOVER_HERE = pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0))
 SPIN_UP = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 0.4, 0.0, True, 2.0))
+MOTOR_TEST = pack(Port.PARAMETERS, 2, struct.pack("<HB", parameter_toc().index()["motorPowerSet.enable"], 1))
+ONCE = 1e3  # s
 ASKS_TWICE_A_SECOND = pack(Port.HIGH_LEVEL, 0, bytes((3, 0)))  # stop, which a vehicle at rest obeys by doing nothing
 
 
@@ -43,9 +46,13 @@ def mission():
 
 
 class Flown:
-    """One flight in the stepped lab; another client may send `guest` every 20 ms from a phase on."""
+    """One flight in the stepped lab; another client may send `guest` every 20 ms from a phase on.
 
-    def __init__(self, mission, guest=b"", phase=Phase.CONNECT, period=0.02, **settings):
+    The operator gives an `order` as the client begins.
+    """
+
+    def __init__(self, mission, guest=b"", phase=Phase.CONNECT, period=0.02, order=None, **settings):
+        orders = HeldOrders()
         self.lab = SteppedLab(LIMITS.airframe, vehicle=VehicleSettings(**{"auto_arming": False, **settings}))
         self.phases, self.armed = [], False
 
@@ -59,6 +66,7 @@ class Flown:
                 self.phases.append(message.phase)
                 if guest and message.phase is phase:
                     visit()
+                    orders.worst = order
 
         try:
             self.outcome = Pilot(
@@ -66,7 +74,7 @@ class Flown:
                 connect=lambda waiting: connect(self.lab, hear),
                 source=SteppedPoses(self.lab, LIMITS.pose),
                 report=hear,
-                orders=HeldOrders(),
+                orders=orders,
                 clock=self.lab.clock,
             ).fly()
             self.reason, self.code = self.outcome.reason, self.outcome.exit_code
@@ -120,6 +128,25 @@ def test_another_commander_is_heard_before_arming(mission, sign, guest, period, 
     assert flown.code is ExitCode.PREFLIGHT
     assert COMMANDER_SIGNS[sign].name in flown.reason
     assert Phase.ARM not in flown.phases
+
+
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.GO_TO_START, Phase.STREAM, Phase.LAND])
+def test_a_motor_test_that_starts_after_preflight_is_ended_and_the_vehicle_lands(mission, phase):
+    flown = Flown(mission, MOTOR_TEST, phase, period=ONCE)
+    if phase is not Phase.LAND:  # it was landing already
+        assert flown.code is ExitCode.ENDED_BY_SAFETY
+        assert "a motor test is on" in flown.reason
+    assert (Phase.LAND in flown.phases) == (phase is not Phase.ARM)
+    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.supervisor.crashed
+
+
+def test_a_cut_stops_the_motors_of_a_vehicle_under_a_motor_test(mission):
+    flown = Flown(mission, MOTOR_TEST, Phase.STREAM, period=ONCE, order=Order.CUT)
+    assert flown.code is ExitCode.ENDED_BY_OPERATOR
+    assert flown.lab.vehicle.supervisor.locked
+    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.stabilizer.loop.motors.any()
 
 
 @pytest.mark.parametrize("guest", [HOVER_HERE, ZERO_ATTITUDE])

@@ -84,6 +84,12 @@ class AbortReason(Enum):
         "The vehicle's supervisor reports that it tumbled, is locked or has crashed. The motors stop.",
         "restart the vehicle, and replay the record to see what came before",
     )
+    MOTOR_TEST = (
+        "a motor test is on",
+        "Another client has set `motorPowerSet.enable` since preflight. The motors then turn as it says, disarmed and "
+        "locked too. cfplan sets it to 0 again, and the vehicle lands.",
+        "end every other client of this vehicle",
+    )
     BATTERY_LOW = (
         "the battery is down to {volts:.2f} V",
         "The average under load is below `battery.under_load`. The vehicle lands.",

@@ -51,6 +51,7 @@ def prepare(
     _feed(loop)
     stood = _converge(loop)
     _preflight(loop, read, stood)
+    loop.watch_motor_test()
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]

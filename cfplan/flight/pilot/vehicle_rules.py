@@ -315,7 +315,8 @@ UNKNOWABLE: tuple[tuple[str, str], ...] = (
     ),
     (
         "a parameter that is changed after preflight",
-        "Nobody is told of another client's writing; what cfplan rests on is read once, on the ground.",
+        "Nobody is told of another client's writing; what cfplan rests on is read once, on the ground. Only "
+        "motorPowerSet.enable is read ten times a second, to the end of the flight.",
     ),
     (
         "a running test of propellers or battery",

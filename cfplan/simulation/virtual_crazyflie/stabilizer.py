@@ -206,10 +206,10 @@ def _drive(loop: Loop, per_command: float) -> None:
     for motor in range(4):
         if allowed and not loop.motors[motor] > loop.idle[0]:
             loop.motors[motor] = loop.idle[0]
-        if loop.override[0] > 0.0:
-            loop.motors[motor] = loop.override[1 + motor if loop.override[0] == 1.0 else 1]
         if not (allowed and loop.motors[motor] > 0.0):  # NaN is off too, as its cast to an integer is
             loop.motors[motor] = 0.0
+        if loop.override[0] > 0.0:  # by the motor driver: also where the supervisor lets no motor turn
+            loop.motors[motor] = loop.override[1 + motor if loop.override[0] == 1.0 else 1]
         off = off and loop.motors[motor] == 0.0
         vehicle[ASKED + motor] = loop.motors[motor] * per_command
     if off and loop.counts[_ASKED] == 0:
