@@ -1,5 +1,6 @@
 """Preflight against the virtual Crazyflie: each row of its table made wrong on board."""
 
+import math
 import struct
 from dataclasses import fields, replace
 from pathlib import Path
@@ -34,6 +35,7 @@ LIMITS = load_limits(REPOSITORY / "safety.yaml")
 ZERO_ATTITUDE = pack(Port.ATTITUDE_SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
 HOVER_HERE = pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0))
 SPIN_UP = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 0.4, 0.0, True, 2.0))
+GOES_NOWHERE = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBBBfffff", 12, 0, 0, 0, math.nan, 0.0, 0.4, 0.0, 2.0))
 MOTOR_TEST = pack(Port.PARAMETERS, 2, struct.pack("<HB", parameter_toc().index()["motorPowerSet.enable"], 1))
 ONCE = 1e3  # s
 ASKS_TWICE_A_SECOND = pack(Port.HIGH_LEVEL, 0, bytes((3, 0)))  # stop, which a vehicle at rest obeys by doing nothing
@@ -118,9 +120,10 @@ def test_what_is_set_flies_whatever_it_was_before(mission, rule):
     ("sign", "guest", "period", "auto_arming"),
     [
         (0, SPIN_UP, 1.0, True),
-        (1, ASKS_TWICE_A_SECOND, 0.5, False),
-        (2, HOVER_HERE, 0.02, True),
-        (2, ZERO_ATTITUDE, 0.02, True),
+        (1, GOES_NOWHERE, ONCE, True),
+        (2, ASKS_TWICE_A_SECOND, 0.5, False),
+        (3, HOVER_HERE, 0.02, True),
+        (3, ZERO_ATTITUDE, 0.02, True),
     ],
 )
 def test_another_commander_is_heard_before_arming(mission, sign, guest, period, auto_arming):

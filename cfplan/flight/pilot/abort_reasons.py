@@ -81,7 +81,8 @@ class AbortReason(Enum):
     )
     SUPERVISOR_FAULT = (
         "the vehicle {fault}",
-        "The vehicle's supervisor reports that it tumbled, is locked or has crashed. The motors stop.",
+        "The vehicle's supervisor reports that it tumbled, is locked or has crashed, or that a deck failed, for which "
+        "firmware from 2026.08 on stops the motors itself. The motors stop.",
         "restart the vehicle, and replay the record to see what came before",
     )
     MOTOR_TEST = (

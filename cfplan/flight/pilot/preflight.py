@@ -115,7 +115,7 @@ def check_supervisor(snapshot: PreflightSnapshot) -> Check:
         faults.append("cannot fly")
     return Check(
         "supervisor", ", ".join(faults) or "can fly", "can fly", not faults,
-        "set the vehicle upright and restart it",
+        "set the vehicle upright and restart it; after a fault of a deck, take the deck off",
     )  # fmt: skip
 
 

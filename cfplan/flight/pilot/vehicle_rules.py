@@ -10,7 +10,7 @@ from dataclasses import astuple, dataclass
 from enum import StrEnum
 
 from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
-from cfplan.flight.radio.supervisor_bits import HIGH_LEVEL_ACTIVE
+from cfplan.flight.radio.supervisor_bits import HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
 from cfplan.flight.setpoints.rate_trade import GAIN_TOLERANCE
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
@@ -286,6 +286,12 @@ COMMANDER_SIGNS: tuple[CommanderSign, ...] = (
     CommanderSign(
         "the on-board commander flies a trajectory", lambda traffic: bool(traffic.supervisor & HIGH_LEVEL_ACTIVE),
         "Bit 8 of supervisor.info is set before cfplan has asked for anything, so an app or another client has.",
+    ),
+    CommanderSign(
+        "the on-board commander is disabled", lambda traffic: bool(traffic.supervisor & HIGH_LEVEL_DISABLED),
+        "Bit 10 of supervisor.info is set by an app that commands the vehicle instead, or after a command that was not "
+        "a number. The commander's null setpoints then no longer keep the supervisor from locking.",
+        since=(2025, 9),
     ),
     CommanderSign(
         "the on-board commander answers others", lambda traffic: bool(traffic.replies),

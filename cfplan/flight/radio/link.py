@@ -64,6 +64,7 @@ class Link:
         self.has_setpoint = False  # the controller has one, from whomever; known until `stop_preflight_logs`
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
         self.motor_test = False  # a motor test overrides the controller, by the last answer to `ask_motor_test`
+        self._motor_test = b""  # the number of its parameter, as packets have it, once it was asked for
         self.firmware = ""
         self._preflight_blocks: list[Any] = []
         self._revivals: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
@@ -134,7 +135,8 @@ class Link:
         """Ask whether a motor test is on; `motor_test` is set when the answer comes."""
         number = self.parameter_number(_MOTOR_TEST)
         if number is not None:
-            self._send(_PARAMETER_PORT, _READ_PARAMETER, struct.pack("<H", number))
+            self._motor_test = struct.pack("<H", number)
+            self._send(_PARAMETER_PORT, _READ_PARAMETER, self._motor_test)
 
     def end_motor_test(self) -> None:
         """Switch a motor test off: it turns the motors whatever controller, arming and emergency stop say."""
@@ -323,10 +325,8 @@ class Link:
             self.replies[packet.data[0]] = packet.data[3]
 
     def _on_parameter(self, packet: Any) -> None:
-        if packet.channel == _READ_PARAMETER and len(packet.data) >= 4:
-            number, error, value = struct.unpack_from("<HBB", packet.data)
-            if not error and number == self.parameter_number(_MOTOR_TEST):
-                self.motor_test = bool(value)
+        if packet.channel == _READ_PARAMETER and packet.data[:2] == self._motor_test and len(packet.data) == 4:
+            self.motor_test = bool(packet.data[3])
 
     def _on_platform(self, packet: Any) -> None:
         if packet.channel == 1 and len(packet.data) > 1 and packet.data[0] == 1:

@@ -75,6 +75,7 @@ class Supervisor:
         self.armed = False
         self.crashed = False
         self.tumbled = False
+        self.deck_fault = False  # of a deck that tests itself
         self.ever_locked = False
         self._say = say
         self._emergency = False
@@ -184,7 +185,7 @@ class Supervisor:
                 return State.RESET
             return State.FLYING if now.flying else state
         if state is State.WARNING_LEVEL_OUT:
-            if now.timeout or now.tumbled or now.emergency:
+            if now.timeout or now.tumbled or now.emergency or self.deck_fault:
                 return State.FREE_FALL
             return state if now.warning else State.FLYING
         if state is State.LOCKED:
@@ -194,7 +195,7 @@ class Supervisor:
         return self._in_flight(now) if state is State.FLYING else self._on_ground(now)
 
     def _in_flight(self, now: _Conditions) -> State:
-        if now.timeout:
+        if now.timeout or self.deck_fault:
             return State.FREE_FALL
         if now.tumbled:
             return State.CRASHED
@@ -206,8 +207,8 @@ class Supervisor:
 
     def _on_ground(self, now: _Conditions) -> State:
         if self.state is State.CHECKS_NOT_PASSED:
-            return self.state if now.tumbled else State.CHECKS_PASSED
-        if now.tumbled:
+            return self.state if now.tumbled or self.deck_fault else State.CHECKS_PASSED
+        if now.tumbled or (self.deck_fault and self.state is not State.ARMING):
             return State.CHECKS_NOT_PASSED
         if self.state is State.CHECKS_PASSED:
             return State.ARMING if now.armed else self.state
@@ -238,7 +239,7 @@ class Supervisor:
         if self.auto_arming and state is State.CHECKS_PASSED:
             self.armed = True
 
-    def info(self, *, planner_active: bool, planner_finished: bool) -> int:
+    def info(self, *, planner_active: bool, planner_finished: bool, planner_disabled: bool) -> int:
         """Return the bits of supervisor.info."""
         return (
             (self.state is State.CHECKS_PASSED)
@@ -251,4 +252,6 @@ class Supervisor:
             | self.crashed << 7
             | planner_active << 8
             | planner_finished << 9
+            | planner_disabled << 10
+            | self.deck_fault << 11
         )

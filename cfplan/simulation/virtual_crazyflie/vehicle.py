@@ -55,6 +55,7 @@ _NO_POSES = np.zeros((0, 9))
 _MOTORS_OFF = Setpoint()
 
 _SUPERVISOR_SINCE = 12  # protocol with which the port came
+_DECKS_SUPERVISED_SINCE = (2026, 8)  # firmware
 _RESIDUAL_CORRECT_SINCE = (2025, 9, 1)  # firmware
 
 
@@ -198,8 +199,9 @@ class VirtualCrazyflie:
     def info(self) -> int:
         """Return the bits of supervisor.info."""
         return self.supervisor.info(
-            planner_active=self.planner.state is not PlannerState.IDLE,
+            planner_active=self.planner.state in (PlannerState.FLYING, PlannerState.LANDING),
             planner_finished=self.planner.finished(self.tick / 1000),
+            planner_disabled=self.planner.state is PlannerState.DISABLED,
         )
 
     def _send(self, port: Port, channel: int, payload: bytes) -> None:
@@ -219,7 +221,8 @@ class VirtualCrazyflie:
         can_fly = self.supervisor.can_fly
         if can_fly:
             wanted = self.planner.setpoint(self.tick / 1000)
-            self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
+            if wanted is not None:
+                self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
         if self.tick % SUPERVISOR_PERIOD == 0:
             self.supervisor.update(
                 self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
@@ -251,6 +254,7 @@ class VirtualCrazyflie:
             self.battery.sag = 0.0
         elif self.battery.sag == 0.0:
             self.battery.sag = max(self.battery.voltage - acting[VehicleFaultKind.BATTERY], 0.0)
+        self.supervisor.deck_fault = VehicleFaultKind.DECK in acting and self._version >= _DECKS_SUPERVISED_SINCE
         if VehicleFaultKind.LOCK in acting and not self.supervisor.locked:
             self.supervisor.lock()
 

@@ -14,7 +14,15 @@ from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.health import GONE, Health
 from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, PARAMETER_RULES, Action, Traffic
-from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, HIGH_LEVEL_ACTIVE, LOCKED, TUMBLED
+from cfplan.flight.radio.supervisor_bits import (
+    CAN_FLY,
+    DECK_FAULT,
+    FLYING,
+    HIGH_LEVEL_ACTIVE,
+    HIGH_LEVEL_DISABLED,
+    LOCKED,
+    TUMBLED,
+)
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.defaults import DEFAULTS
@@ -84,10 +92,12 @@ def test_the_page_on_preflight_explains_every_line(ground):
         ("supervisor", {"could_fly": False}),
         ("supervisor", {"status": status(bits=CAN_FLY | LOCKED)}),
         ("supervisor", {"status": status(bits=CAN_FLY | TUMBLED)}),
+        ("supervisor", {"status": status(bits=CAN_FLY | DECK_FAULT)}),
         ("supervisor", {"status": status(bits=CAN_FLY | FLYING)}),
         ("battery at rest", {"status": status(voltage=3.8)}),
         ("battery at rest", {"status": status(voltage=math.nan)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY | HIGH_LEVEL_ACTIVE, (), setpoint=False)}),
+        ("other commanders", {"traffic": Traffic(CAN_FLY | HIGH_LEVEL_DISABLED, (), setpoint=False)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY, (7,), setpoint=False)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY, (), setpoint=True)}),
         ("pose rate", {"poses": poses(rate=30.0)}),

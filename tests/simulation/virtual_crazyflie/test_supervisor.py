@@ -5,12 +5,15 @@ import struct
 import numpy as np
 import pytest
 
+from cfplan.flight.radio.supervisor_bits import DECK_FAULT, HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State, Supervisor
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.vehicle.airframes import AIRFRAMES
 
+PLANNER_IDLE = {"planner_active": False, "planner_finished": False, "planner_disabled": False}
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 RUNNING, OFF = np.full(4, 30000.0), np.zeros(4)
 
@@ -102,7 +105,7 @@ def test_a_tilt_that_lasts_is_a_crash(acceleration, seconds):
     hand = Hand().fly()
     assert hand.look(seconds - 0.04, motors=RUNNING, acceleration=acceleration)[-1] is State.FLYING
     assert hand.look(0.16, motors=RUNNING, acceleration=acceleration)[-1] is State.CRASHED
-    assert hand.supervisor.info(planner_active=False, planner_finished=False) & 0x80
+    assert hand.supervisor.info(**PLANNER_IDLE) & 0x80
 
 
 def test_free_fall_is_no_crash():
@@ -151,9 +154,35 @@ def test_disarming_in_flight_stops_the_motors():
 def test_info_bits_are_those_that_cflib_knows():
     hand = Hand()
     hand.look(0.2)
-    assert hand.supervisor.info(planner_active=False, planner_finished=True) == 0b10_0000_1110
+    assert hand.supervisor.info(**PLANNER_IDLE | {"planner_finished": True}) == 0b10_0000_1110
     hand.look(0.1, motors=RUNNING)
-    assert hand.supervisor.info(planner_active=True, planner_finished=False) == 0b1_0001_1110
+    assert hand.supervisor.info(**PLANNER_IDLE | {"planner_active": True}) == 0b1_0001_1110
+
+
+def test_a_planner_that_is_given_no_number_is_disabled_until_a_setpoint_comes(hovering):
+    assert hovering.go_to(np.nan, 0.0, 1.0) == 0
+    hovering.run(0.1)
+    assert hovering.vehicle.info() & HIGH_LEVEL_DISABLED
+    assert not hovering.vehicle.info() & HIGH_LEVEL_ACTIVE
+    hovering.stream_hover(0.1)
+    assert not hovering.vehicle.info() & HIGH_LEVEL_DISABLED
+
+
+def test_the_fault_of_a_deck_keeps_a_vehicle_on_the_floor_and_locks_one_in_the_air(make_rig):
+    on_floor, in_air, old = make_rig(), make_rig(), make_rig(VehicleSettings(firmware="2026.04"))
+    for rig in (in_air, old):
+        rig.prepare()
+        rig.take_off()
+        rig.run(1.0)
+    for rig in (on_floor, in_air, old):
+        rig.vehicle.inject(VehicleFault(VehicleFaultKind.DECK, 0.0, 0.3))
+        rig.run(0.2)
+    assert on_floor.state is State.CHECKS_NOT_PASSED
+    assert on_floor.vehicle.info() & DECK_FAULT
+    assert in_air.state is State.LOCKED
+    assert old.state is State.FLYING  # it knows nothing of decks
+    on_floor.run(0.5)
+    assert on_floor.state is State.READY_TO_FLY
 
 
 def test_the_port_answers_arming_recovery_and_the_bits(make_rig):
