@@ -84,6 +84,23 @@ class Timeouts:
 TIMEOUTS: tuple[tuple[tuple[int, ...], Timeouts], ...] = (((2023, 6), Timeouts()),)
 
 
+YAW_CORRECT = (2025, 9, 1)  # the first firmware whose filter does not diverge with yaw beyond 90°
+FLIES_AS_PREDICTED = (2026, 4)
+"""The first firmware whose filter knows rotor drag (kalman.dragB): the oldest that deviates as dry runs say."""
+# The largest deviations of firmware from each version on, at 2 m/s on flights/line, figure8 and loop3d, with that
+# firmware itself around the simulated body; from FLIES_AS_PREDICTED on they are 2 to 4 cm.
+EARLIER_DEVIATIONS: tuple[tuple[tuple[int, ...], str], ...] = (
+    (YAW_CORRECT, "8 to 13 cm, and 2 cm low"),
+    ((2025, 12), "5 to 9 cm"),
+)
+
+
+def earlier_deviation(version: tuple[int, ...]) -> str:
+    """Return how far a firmware before `FLIES_AS_PREDICTED` deviates, in words; empty where that is not known."""
+    known = [text for since, text in EARLIER_DEVIATIONS if since <= version < FLIES_AS_PREDICTED]
+    return known[-1] if known else ""
+
+
 def version_of(text: str) -> tuple[int, ...]:
     """Return the version in what a vehicle says of its firmware: "2025.09.1 (abc)" is (2025, 9, 1), "" is ()."""
     found = re.search(r"\d+(?:\.\d+)*", text)

@@ -11,7 +11,7 @@ from septic_flight import septic_payloads
 from wrong_values import wrong_on_board
 
 from cfplan.errors import CfplanError, ExitCode
-from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
+from cfplan.flight.firmware import GAIN_PARAMETERS, YAW_CORRECT, gains_for
 from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
@@ -88,7 +88,8 @@ class Flown:
 @pytest.mark.parametrize("auto_arming", [False, True])
 def test_a_vehicle_as_it_comes_flies(mission, firmware, auto_arming):
     version, protocol = firmware
-    flown = Flown(mission, firmware=version, protocol=protocol, auto_arming=auto_arming)
+    accepting = replace(LIMITS, firmware=replace(LIMITS.firmware, oldest=YAW_CORRECT))
+    flown = Flown(replace(mission, limits=accepting), firmware=version, protocol=protocol, auto_arming=auto_arming)
     assert flown.code is ExitCode.OK, flown.reason
     assert flown.outcome.deviation.max < 0.1
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from enum import StrEnum
 
-from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
+from cfplan.flight.firmware import FLIES_AS_PREDICTED, GAIN_PARAMETERS, gains_for
 from cfplan.flight.radio.supervisor_bits import HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
 from cfplan.flight.setpoints.rate_trade import GAIN_TOLERANCE
 from cfplan.safety.limits import Limits
@@ -181,8 +181,8 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
             f"kalman.dragB_{axis}", _exactly(_drag), "the airframe's rotor drag over its mass", Action.SET,
             "A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its "
             "attitude is 4° off.",
-            "restart the vehicle", since=(2026, 4), optional=True,
-            missing="expect it some centimetres off at speed",
+            "restart the vehicle", since=FLIES_AS_PREDICTED, optional=True,
+            missing="its filter takes drag for tilt, so it deviates as the row of its firmware says",
         )
         for axis in "xy"
     ),

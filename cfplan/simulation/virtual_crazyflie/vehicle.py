@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import GAIN_PARAMETERS, Timeouts
+from cfplan.flight.firmware import GAIN_PARAMETERS, YAW_CORRECT, Timeouts
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.simulation.engine.layout import MASS, MOTORS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
@@ -56,7 +56,6 @@ _MOTORS_OFF = Setpoint()
 
 _SUPERVISOR_SINCE = 12  # protocol with which the port came
 _DECKS_SUPERVISED_SINCE = (2026, 8)  # firmware
-_RESIDUAL_CORRECT_SINCE = (2025, 9, 1)  # firmware
 
 
 class VirtualCrazyflie:
@@ -282,7 +281,7 @@ class VirtualCrazyflie:
     def _poses(self) -> NDArray:
         """Return the measurements (n, 9) that have come, for the filter."""
         poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
-        if self._version < _RESIDUAL_CORRECT_SINCE:
+        if self._version < YAW_CORRECT:
             _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
         return poses if self.parameters["stabilizer.estimator"] == KALMAN else _NO_POSES
 
