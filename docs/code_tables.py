@@ -19,7 +19,7 @@ from cfplan.flight.mocap.pose_predictor import FARTHEST
 from cfplan.flight.mocap.source import OPEN_WITHIN
 from cfplan.flight.pilot.abort_monitor import LATEST_SETPOINT
 from cfplan.flight.pilot.abort_reasons import AbortReason
-from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER
+from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, MOTOR_TEST_PERIOD
 from cfplan.flight.pilot.health import LOG_GONE, UPLINK_GONE
 from cfplan.flight.pilot.landing import MAX_BLIND_LANDING, MOTORS_STOP_WITHIN, POSES_TRUSTED_AFTER
 from cfplan.flight.pilot.manoeuvres import READY_TIMEOUT
@@ -143,6 +143,8 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
                 "it brakes, lands or is cut, by threshold", "the pilot", "flight.patience"),
         TimeOut("deviation, fence, tumbling or a lock", 0.0, "it brakes, lands or is cut, by threshold", "the pilot",
                 "flight"),
+        TimeOut("a motor test that another client starts, asked for every", MOTOR_TEST_PERIOD,
+                "it is switched off, and the vehicle lands", "the pilot"),
         TimeOut("battery voltage under load, averaged over", BATTERY.under_load_seconds, "it lands", "the pilot",
                 "battery.under_load_seconds"),
     ),

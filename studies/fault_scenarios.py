@@ -128,7 +128,7 @@ SCENARIOS: tuple[Scenario, ...] = (
         phase=Phase.ARM, moment=0.2, grounded=True,
     ),
     _odd("firmware of 2025.09", grounded=True, protocol=10, firmware="2025.09"),
-    _odd("firmware of 2025.12", protocol=10, firmware="2025.12"),
+    _odd("firmware of 2025.12", grounded=True, protocol=10, firmware="2025.12"),
     _odd("start place 0.5 m off", position=(0.35, -2.85, 0.0)),
     Scenario(
         "two bodies swapped", Rung.NONE, (ViconFault(FaultKind.SWAP, 0.0, FOR_GOOD),), from_start=True, grounded=True,

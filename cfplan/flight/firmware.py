@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from cfplan.vehicle.airframe import Airframe
 
 NEWEST_KNOWN = (2026, 8)  # the newest firmware that these figures were read from
-DRAG_SINCE = (2026, 4)  # the first whose filter can be told of rotor drag (kalman.dragB)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +82,23 @@ class Timeouts:
 
 # Each from this version on; read in supervisor.c of every release from 2023.06 to 2026.08, which agree.
 TIMEOUTS: tuple[tuple[tuple[int, ...], Timeouts], ...] = (((2023, 6), Timeouts()),)
+
+
+YAW_CORRECT = (2025, 9, 1)  # the first firmware whose filter does not diverge with yaw beyond 90°
+FLIES_AS_PREDICTED = (2026, 4)
+"""The first firmware whose filter knows rotor drag (kalman.dragB): the oldest that deviates as dry runs say."""
+# The largest deviations of firmware from each version on, at 2 m/s on flights/line, figure8 and loop3d, with that
+# firmware itself around the simulated body; from FLIES_AS_PREDICTED on they are 2 to 4 cm.
+EARLIER_DEVIATIONS: tuple[tuple[tuple[int, ...], str], ...] = (
+    (YAW_CORRECT, "8 to 13 cm, and 2 cm low"),
+    ((2025, 12), "5 to 9 cm"),
+)
+
+
+def earlier_deviation(version: tuple[int, ...]) -> str:
+    """Return how far a firmware before `FLIES_AS_PREDICTED` deviates, in words; empty where that is not known."""
+    known = [text for since, text in EARLIER_DEVIATIONS if since <= version < FLIES_AS_PREDICTED]
+    return known[-1] if known else ""
 
 
 def version_of(text: str) -> tuple[int, ...]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import DRAG_SINCE, gains_for
+from cfplan.flight.firmware import FLIES_AS_PREDICTED, gains_for
 from cfplan.flight.pilot.vehicle_rules import EXTERNAL_ATTITUDE_STD, EXTERNAL_POSITION_STD
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
@@ -194,7 +194,7 @@ def knows_drag(limits: Limits) -> bool:
 
     Before a vehicle is connected, safety.yaml alone says what firmware it may have.
     """
-    return limits.firmware.oldest >= DRAG_SINCE
+    return limits.firmware.oldest >= FLIES_AS_PREDICTED
 
 
 def rehearse_motion(

@@ -114,6 +114,7 @@ class World:
     armed: bool = False
     closed: bool = False
     stopped: bool = False
+    motor_test: bool = False  # another client has started one
 
     def __post_init__(self) -> None:
         self.clock = SteppedClock(100.0, self.pass_time)
@@ -244,6 +245,12 @@ class World:
 
     def release_priority(self) -> None:
         self._note_once("release")
+
+    def ask_motor_test(self) -> None:
+        pass
+
+    def end_motor_test(self) -> None:
+        self.motor_test = False
 
     def revive_log(self, name: str) -> None:
         if name not in self.revived:

@@ -1,5 +1,6 @@
 """Preflight against the virtual Crazyflie: each row of its table made wrong on board."""
 
+import math
 import struct
 from dataclasses import fields, replace
 from pathlib import Path
@@ -10,8 +11,8 @@ from septic_flight import septic_payloads
 from wrong_values import wrong_on_board
 
 from cfplan.errors import CfplanError, ExitCode
-from cfplan.flight.firmware import GAIN_PARAMETERS, gains_for
-from cfplan.flight.pilot.keys import HeldOrders
+from cfplan.flight.firmware import GAIN_PARAMETERS, YAW_CORRECT, gains_for
+from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action
@@ -24,15 +25,20 @@ from cfplan.simulation.engine.flight import Conditions, fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
+from cfplan.simulation.virtual_crazyflie.parameters import parameter_toc
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
+from cfplan.vehicle.airframes import AIRFRAMES
 
 REPOSITORY = Path(__file__).parents[2]
 LIMITS = load_limits(REPOSITORY / "safety.yaml")
 ZERO_ATTITUDE = pack(Port.ATTITUDE_SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
 HOVER_HERE = pack(Port.SETPOINT, 0, struct.pack("<Bffff", 7, 0.5, 0.5, 0.4, 0.0))
 SPIN_UP = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBff?f", 7, 0, 0.4, 0.0, True, 2.0))
+GOES_NOWHERE = pack(Port.HIGH_LEVEL, 0, struct.pack("<BBBBfffff", 12, 0, 0, 0, math.nan, 0.0, 0.4, 0.0, 2.0))
+MOTOR_TEST = pack(Port.PARAMETERS, 2, struct.pack("<HB", parameter_toc().index()["motorPowerSet.enable"], 1))
+ONCE = 1e3  # s
 ASKS_TWICE_A_SECOND = pack(Port.HIGH_LEVEL, 0, bytes((3, 0)))  # stop, which a vehicle at rest obeys by doing nothing
 
 
@@ -43,10 +49,14 @@ def mission():
 
 
 class Flown:
-    """One flight in the stepped lab; another client may send `guest` every 20 ms from a phase on."""
+    """One flight in the stepped lab; another client may send `guest` every 20 ms from a phase on.
 
-    def __init__(self, mission, guest=b"", phase=Phase.CONNECT, period=0.02, **settings):
-        self.lab = SteppedLab(LIMITS.airframe, vehicle=VehicleSettings(**{"auto_arming": False, **settings}))
+    The operator gives an `order` as the client begins.
+    """
+
+    def __init__(self, mission, guest=b"", phase=Phase.CONNECT, period=0.02, order=None, **settings):
+        orders = HeldOrders()
+        self.lab = SteppedLab(mission.limits.airframe, vehicle=VehicleSettings(**{"auto_arming": False, **settings}))
         self.phases, self.armed = [], False
 
         def visit():
@@ -59,6 +69,7 @@ class Flown:
                 self.phases.append(message.phase)
                 if guest and message.phase is phase:
                     visit()
+                    orders.worst = order
 
         try:
             self.outcome = Pilot(
@@ -66,7 +77,7 @@ class Flown:
                 connect=lambda waiting: connect(self.lab, hear),
                 source=SteppedPoses(self.lab, LIMITS.pose),
                 report=hear,
-                orders=HeldOrders(),
+                orders=orders,
                 clock=self.lab.clock,
             ).fly()
             self.reason, self.code = self.outcome.reason, self.outcome.exit_code
@@ -78,9 +89,21 @@ class Flown:
 @pytest.mark.parametrize("auto_arming", [False, True])
 def test_a_vehicle_as_it_comes_flies(mission, firmware, auto_arming):
     version, protocol = firmware
-    flown = Flown(mission, firmware=version, protocol=protocol, auto_arming=auto_arming)
+    accepting = replace(LIMITS, firmware=replace(LIMITS.firmware, oldest=YAW_CORRECT))
+    flown = Flown(replace(mission, limits=accepting), firmware=version, protocol=protocol, auto_arming=auto_arming)
     assert flown.code is ExitCode.OK, flown.reason
     assert flown.outcome.deviation.max < 0.1
+
+
+@pytest.mark.parametrize("idle", [7000, 0])
+def test_a_brushless_vehicle_flies_if_its_rotors_turn_as_it_is_armed(mission, idle):
+    brushless = replace(LIMITS, airframe=AIRFRAMES["crazyflie-2.1-brushless"])
+    flown = Flown(replace(mission, limits=brushless), stored={"powerDist.idleThrust": idle})
+    assert flown.code is (ExitCode.OK if idle else ExitCode.PREFLIGHT), flown.reason
+    assert not flown.lab.vehicle.supervisor.armed
+    if not idle:
+        assert "does not arm" in flown.reason
+        assert "powerDist.idleThrust" in flown.reason
 
 
 @pytest.mark.parametrize("rule", PARAMETER_RULES, ids=lambda rule: rule.name)
@@ -110,9 +133,10 @@ def test_what_is_set_flies_whatever_it_was_before(mission, rule):
     ("sign", "guest", "period", "auto_arming"),
     [
         (0, SPIN_UP, 1.0, True),
-        (1, ASKS_TWICE_A_SECOND, 0.5, False),
-        (2, HOVER_HERE, 0.02, True),
-        (2, ZERO_ATTITUDE, 0.02, True),
+        (1, GOES_NOWHERE, ONCE, True),
+        (2, ASKS_TWICE_A_SECOND, 0.5, False),
+        (3, HOVER_HERE, 0.02, True),
+        (3, ZERO_ATTITUDE, 0.02, True),
     ],
 )
 def test_another_commander_is_heard_before_arming(mission, sign, guest, period, auto_arming):
@@ -120,6 +144,25 @@ def test_another_commander_is_heard_before_arming(mission, sign, guest, period, 
     assert flown.code is ExitCode.PREFLIGHT
     assert COMMANDER_SIGNS[sign].name in flown.reason
     assert Phase.ARM not in flown.phases
+
+
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.GO_TO_START, Phase.STREAM, Phase.LAND])
+def test_a_motor_test_that_starts_after_preflight_is_ended_and_the_vehicle_lands(mission, phase):
+    flown = Flown(mission, MOTOR_TEST, phase, period=ONCE)
+    if phase is not Phase.LAND:  # it was landing already
+        assert flown.code is ExitCode.ENDED_BY_SAFETY
+        assert "a motor test is on" in flown.reason
+    assert (Phase.LAND in flown.phases) == (phase is not Phase.ARM)
+    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.supervisor.crashed
+
+
+def test_a_cut_stops_the_motors_of_a_vehicle_under_a_motor_test(mission):
+    flown = Flown(mission, MOTOR_TEST, Phase.STREAM, period=ONCE, order=Order.CUT)
+    assert flown.code is ExitCode.ENDED_BY_OPERATOR
+    assert flown.lab.vehicle.supervisor.locked
+    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.stabilizer.loop.motors.any()
 
 
 @pytest.mark.parametrize("guest", [HOVER_HERE, ZERO_ATTITUDE])
@@ -136,8 +179,9 @@ def test_before_2026_08_a_joystick_at_rest_is_heard_only_by_what_it_does(mission
     """What the table says cannot be known: the modes of a setpoint are not logged."""
     flown = Flown(mission, ZERO_ATTITUDE, firmware="2026.04", auto_arming=True)
     assert all(check.passed for check in flown.outcome.checks)
-    assert flown.code is not ExitCode.OK
-    assert flown.lab.truth().position[:, 2].max() < 0.2
+    assert flown.code is ExitCode.ENDED_BY_SAFETY  # half of its setpoints stop the motors, so it does not hold a place
+    assert Phase.STREAM not in flown.phases
+    assert flown.lab.truth().position[-1, 2] == 0.0
 
 
 def test_gains_that_may_fly_fly_what_the_dry_run_flew():

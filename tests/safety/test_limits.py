@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from cfplan.errors import InputError
-from cfplan.flight.firmware import DRAG_SINCE, NEWEST_KNOWN
+from cfplan.flight.firmware import FLIES_AS_PREDICTED, NEWEST_KNOWN
 from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.safety.space import SIDES, Box, Cylinder
@@ -53,7 +53,7 @@ def test_the_projects_own_file_says_what_the_design_says():
     assert limits.flight.acceleration.brake == limits.flight.angular_velocity.brake == 10.0
     assert limits.flight.deviation == Ladder(0.3, 0.6, 1.0)
     assert [high - low for low, high in zip(limits.space.low, limits.space.high, strict=True)] == [4.5, 8.0, 2.0]
-    assert (limits.firmware.oldest, limits.firmware.newest) == (DRAG_SINCE, NEWEST_KNOWN)
+    assert (limits.firmware.oldest, limits.firmware.newest) == (FLIES_AS_PREDICTED, NEWEST_KNOWN)
 
 
 @pytest.mark.parametrize("vehicle", AIRFRAMES)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import DRAG_SINCE, gains_for
+from cfplan.flight.firmware import FLIES_AS_PREDICTED, gains_for
 from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.min_snap import min_snap
@@ -29,7 +29,7 @@ FLIGHT = FlightLimits(
     acceleration=Ladder(10.0, 15.0, 30.0), angular_velocity=Ladder(10.0, 15.0, 30.0), patience=0.1,
 )  # fmt: skip
 SHIPPED = load_limits(Path(__file__).parents[2] / "safety.yaml")
-KNOWS_DRAG = replace(SHIPPED.firmware, oldest=DRAG_SINCE)
+KNOWS_DRAG = replace(SHIPPED.firmware, oldest=FLIES_AS_PREDICTED)
 LIMITS = replace(SHIPPED, airframe=AIRFRAME, flight=FLIGHT, firmware=KNOWS_DRAG)
 NONE = Spread(mass=0.0, thrust_scale=0.0, drag=0.0, velocity_moment=0.0, motor_time_constant=0.0)
 PLAN = PlanLimits(

@@ -81,8 +81,15 @@ class AbortReason(Enum):
     )
     SUPERVISOR_FAULT = (
         "the vehicle {fault}",
-        "The vehicle's supervisor reports that it tumbled, is locked or has crashed. The motors stop.",
+        "The vehicle's supervisor reports that it tumbled, is locked or has crashed, or that a deck failed, for which "
+        "firmware from 2026.08 on stops the motors itself. The motors stop.",
         "restart the vehicle, and replay the record to see what came before",
+    )
+    MOTOR_TEST = (
+        "a motor test is on",
+        "Another client has set `motorPowerSet.enable` since preflight. The motors then turn as it says, disarmed and "
+        "locked too. cfplan sets it to 0 again, and the vehicle lands.",
+        "end every other client of this vehicle",
     )
     BATTERY_LOW = (
         "the battery is down to {volts:.2f} V",

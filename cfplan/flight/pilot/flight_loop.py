@@ -23,7 +23,7 @@ from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
 from cfplan.flight.mocap.pose_steps import SMALLEST, PoseSteps
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, fault_abort, ordered
-from cfplan.flight.pilot.abort_reasons import Abort
+from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.health import FRESH, GONE, UPLINK_GONE, Descent, Health, HealthMonitor
@@ -43,6 +43,7 @@ from cfplan.vehicle.rotations import yaw_of
 
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
+MOTOR_TEST_PERIOD = 0.1  # s between two questions whether a motor test is on
 _RECENT = 1.0  # s of good poses that are kept
 VELOCITY_MISMATCH = 0.2
 """m/s, horizontal: difference between the velocities of poses and estimate, in slow flight, above which poses are
@@ -117,6 +118,7 @@ class FlightLoop:
         self._source_fault = ""
         self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
+        self._asked_motor_test = math.inf  # s, when the vehicle was last asked whether a motor test is on
         self.recent: deque[Pose] = deque()  # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
 
@@ -146,6 +148,10 @@ class FlightLoop:
         """Close the pose source if it is open."""
         if self._feeding:
             self._source.close()
+
+    def watch_motor_test(self) -> None:
+        """From now on a motor test that another client starts is ended, and ends the flight."""
+        self._asked_motor_test = -math.inf
 
     def lift_off(self) -> None:
         """From now on every trigger of the abort ladder counts, not only orders."""
@@ -273,6 +279,7 @@ class FlightLoop:
         late = max(now - due, now - self._sent_at - 1.0 / self.mission.rate)  # wherever this computer stood still
         self._guard("setpoints", lambda: self._send_setpoint(now, due))
         self._guard("watchdog", lambda: self._keep_alive(now))
+        self._guard("motor test", lambda: self._end_motor_test(now))
         self._take_poses()
         self._guard("proposals", lambda: self._consider_due_proposal(now))
         self._guard("logs", lambda: self._look(now))
@@ -312,6 +319,15 @@ class FlightLoop:
         if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
+
+    def _end_motor_test(self, now: float) -> None:
+        """End a motor test that was started since preflight, and raise AbortRaised; at each tick until it has ended."""
+        if now - self._asked_motor_test > MOTOR_TEST_PERIOD:
+            self._asked_motor_test = now
+            self.link.ask_motor_test()
+        if self.link.motor_test:
+            self.link.end_motor_test()
+            self._leave_for(AbortReason.MOTOR_TEST.abort(Rung.LAND))
 
     def _consider_due_proposal(self, now: float) -> None:
         if self.stream is not None and self.stream is self.plan:

@@ -121,13 +121,18 @@ class Pilot:
             reasons.append(abort.text)
 
     def _cut(self) -> None:
-        """Cut the motors, at every tick until the vehicle reports that it is locked: the radio may lose packets."""
+        """Cut the motors, at every tick until the vehicle reports that it is locked and they stand.
+
+        The radio may lose packets, and a motor test turns the motors of a locked vehicle.
+        """
         loop = self._loop
         loop.end_stream()
 
         def locked() -> bool:
             loop.link.emergency_stop()
-            return bool(loop.bits(LOCKED))
+            loop.link.end_motor_test()
+            status = loop.link.status
+            return status is not None and bool(status.supervisor & LOCKED) and not any(status.motor)
 
         if not locked() and not loop.until(locked, CUT_TIMEOUT):
             self._history.say(Level.ERROR, "the vehicle does not say that its motors were cut")

@@ -51,6 +51,7 @@ def prepare(
     _feed(loop)
     stood = _converge(loop)
     _preflight(loop, read, stood)
+    loop.watch_motor_test()
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
@@ -60,7 +61,11 @@ def prepare(
             _listen_while_armed(loop)
             _require(standing_check(stood, loop.pose().position, loop.mission.limits), "motion capture")
             return floor
-    raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
+    raise PreflightError(
+        "the vehicle does not arm",
+        hint="restart the vehicle; a brushless one arms from firmware 2026.08 on only if powerDist.idleThrust, 7000 by "
+        "default, turns all of its rotors",
+    )
 
 
 def _configure(loop: FlightLoop) -> dict[str, float]:

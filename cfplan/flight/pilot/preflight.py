@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import NEWEST_KNOWN, Timeouts, timeouts_of, version_of, version_text
+from cfplan.flight.firmware import NEWEST_KNOWN, Timeouts, earlier_deviation, timeouts_of, version_of, version_text
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.go_to import go_to_states
@@ -85,10 +85,13 @@ def firmware_check(firmware: str, limits: Limits) -> Check:
             "time-outs and controller were read from older firmware: fly with that; or compare them, and write "
             f'newest: "{version_text(found)}" under firmware: in safety.yaml',
         )  # fmt: skip
-    return Check(
-        "firmware", firmware or "unknown", "≥ " + version_text(oldest), bool(found) and found >= oldest,
-        "update the vehicle's firmware: older filters go wrong with yaw beyond 90°",
-    )  # fmt: skip
+    value, hint, deviation = firmware or "unknown", "update the vehicle's firmware", earlier_deviation(found)
+    if deviation:
+        value += f", which deviates by {deviation}"
+        hint += f'; or accept that deviation by oldest: "{version_text(found)}" under firmware: in safety.yaml'
+    elif found:
+        hint += ": older filters go wrong with yaw beyond 90°"
+    return Check("firmware", value, "≥ " + version_text(oldest), bool(found) and found >= oldest, hint)
 
 
 def check_round_trip(snapshot: PreflightSnapshot) -> Check:
@@ -115,7 +118,7 @@ def check_supervisor(snapshot: PreflightSnapshot) -> Check:
         faults.append("cannot fly")
     return Check(
         "supervisor", ", ".join(faults) or "can fly", "can fly", not faults,
-        "set the vehicle upright and restart it",
+        "set the vehicle upright and restart it; after a fault of a deck, take the deck off",
     )  # fmt: skip
 
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import astuple, dataclass
 from enum import StrEnum
 
-from cfplan.flight.firmware import DRAG_SINCE, GAIN_PARAMETERS, gains_for
-from cfplan.flight.radio.supervisor_bits import HIGH_LEVEL_ACTIVE
+from cfplan.flight.firmware import FLIES_AS_PREDICTED, GAIN_PARAMETERS, gains_for
+from cfplan.flight.radio.supervisor_bits import HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
 from cfplan.flight.setpoints.rate_trade import GAIN_TOLERANCE
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
@@ -181,8 +181,8 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
             f"kalman.dragB_{axis}", _exactly(_drag), "the airframe's rotor drag over its mass", Action.SET,
             "A filter that does not know of drag takes the tilt that holds against it for acceleration: at 2 m/s its "
             "attitude is 4° off.",
-            "restart the vehicle", since=DRAG_SINCE, optional=True,
-            missing="expect it some centimetres off at speed",
+            "restart the vehicle", since=FLIES_AS_PREDICTED, optional=True,
+            missing="its filter takes drag for tilt, so it deviates as the row of its firmware says",
         )
         for axis in "xy"
     ),
@@ -288,6 +288,12 @@ COMMANDER_SIGNS: tuple[CommanderSign, ...] = (
         "Bit 8 of supervisor.info is set before cfplan has asked for anything, so an app or another client has.",
     ),
     CommanderSign(
+        "the on-board commander is disabled", lambda traffic: bool(traffic.supervisor & HIGH_LEVEL_DISABLED),
+        "Bit 10 of supervisor.info is set by an app that commands the vehicle instead, or after a command that was not "
+        "a number. The commander's null setpoints then no longer keep the supervisor from locking.",
+        since=(2025, 9),
+    ),
+    CommanderSign(
         "the on-board commander answers others", lambda traffic: bool(traffic.replies),
         "A vehicle sends its answers to whoever polls it next, so those to another client's commands arrive here.",
     ),
@@ -315,7 +321,8 @@ UNKNOWABLE: tuple[tuple[str, str], ...] = (
     ),
     (
         "a parameter that is changed after preflight",
-        "Nobody is told of another client's writing; what cfplan rests on is read once, on the ground.",
+        "Nobody is told of another client's writing; what cfplan rests on is read once, on the ground. Only "
+        "motorPowerSet.enable is read ten times a second, to the end of the flight.",
     ),
     (
         "a running test of propellers or battery",

@@ -23,6 +23,8 @@ from cfplan.flight.telemetry import Estimate, Telemetry, Triple, VehicleStatus
 from cfplan.vehicle.airframe import GRAVITY
 
 HIGH_LEVEL_PORT, GENERIC_PORT, SUPERVISOR_PORT, PLATFORM_PORT = 8, CRTP_PORT, 9, 13
+_PARAMETER_PORT, _READ_PARAMETER, _WRITE_PARAMETER = 2, 1, 2  # a port and two of its channels
+_MOTOR_TEST = "motorPowerSet.enable"
 
 _MILLI = 1e-3
 _CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ
@@ -61,6 +63,8 @@ class Link:
         self.position_variance: Triple | None = None  # m² along x, y, z
         self.has_setpoint = False  # the controller has one, from whomever; known until `stop_preflight_logs`
         self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
+        self.motor_test = False  # a motor test overrides the controller, by the last answer to `ask_motor_test`
+        self._motor_test = b""  # the number of its parameter, as packets have it, once it was asked for
         self.firmware = ""
         self._preflight_blocks: list[Any] = []
         self._revivals: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
@@ -70,6 +74,7 @@ class Link:
         crazyflie.link_statistics.latency_updated.add_callback(lambda _: self.note_acknowledgement())
         crazyflie.add_port_callback(HIGH_LEVEL_PORT, self._on_reply)
         crazyflie.add_port_callback(PLATFORM_PORT, self._on_platform)
+        crazyflie.add_port_callback(_PARAMETER_PORT, self._on_parameter)
 
     @property
     def protocol(self) -> int:
@@ -126,6 +131,19 @@ class Link:
         else:
             self._send(LOCALIZATION_PORT, 1, b"\x04")
 
+    def ask_motor_test(self) -> None:
+        """Ask whether a motor test is on; `motor_test` is set when the answer comes."""
+        number = self.parameter_number(_MOTOR_TEST)
+        if number is not None:
+            self._motor_test = struct.pack("<H", number)
+            self._send(_PARAMETER_PORT, _READ_PARAMETER, self._motor_test)
+
+    def end_motor_test(self) -> None:
+        """Switch a motor test off: it turns the motors whatever controller, arming and emergency stop say."""
+        number = self.parameter_number(_MOTOR_TEST)
+        if number is not None:
+            self._send(_PARAMETER_PORT, _WRITE_PARAMETER, struct.pack("<HB", number, 0))
+
     def revive_log(self, name: str) -> None:
         """Send the next packet that creates `estimate` or `status` anew; call it each tick while that is silent."""
         payload = next(self._revivals[name])
@@ -134,8 +152,13 @@ class Link:
 
     # For the ground only: these wait for an answer.
 
+    def parameter_number(self, name: str) -> int | None:
+        """Return the number by which packets name a parameter; None if the vehicle lacks it."""
+        element = self._crazyflie.param.toc.get_element_by_complete_name(name)
+        return None if element is None else int(element.ident)
+
     def has_parameter(self, name: str) -> bool:
-        return self._crazyflie.param.toc.get_element_by_complete_name(name) is not None
+        return self.parameter_number(name) is not None
 
     def has_log_variable(self, name: str) -> bool:
         return self._crazyflie.log.toc.get_element_by_complete_name(name) is not None
@@ -245,7 +268,7 @@ class Link:
             self._radio_lock.close()
 
     def restart(self) -> None:
-        """Restart the vehicle's main processor, after `close`; takes 2 s. Raises LinkError if it does not confirm."""
+        """Restart the vehicle's main processor, after `close`; takes 4 s. Raises LinkError if it does not confirm."""
         restart_vehicle(self.uri, self._clock)
 
     def note_acknowledgement(self) -> None:
@@ -300,6 +323,10 @@ class Link:
     def _on_reply(self, packet: Any) -> None:
         if len(packet.data) >= 4:
             self.replies[packet.data[0]] = packet.data[3]
+
+    def _on_parameter(self, packet: Any) -> None:
+        if packet.channel == _READ_PARAMETER and packet.data[:2] == self._motor_test and len(packet.data) == 4:
+            self.motor_test = bool(packet.data[3])
 
     def _on_platform(self, packet: Any) -> None:
         if packet.channel == 1 and len(packet.data) > 1 and packet.data[0] == 1:

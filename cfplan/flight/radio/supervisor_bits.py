@@ -9,5 +9,7 @@ LOCKED = 1 << 6
 CRASHED = 1 << 7
 HIGH_LEVEL_ACTIVE = 1 << 8
 TRAJECTORY_FINISHED = 1 << 9
+HIGH_LEVEL_DISABLED = 1 << 10
+DECK_FAULT = 1 << 11  # from firmware 2026.08 on
 
-FAULTS = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed"}
+FAULTS = {TUMBLED: "tumbled", LOCKED: "locked", CRASHED: "crashed", DECK_FAULT: "reports a fault of a deck"}

@@ -64,8 +64,8 @@ class SteppedLink(Link):
             self._lab.clock.sleep(_STEP)
         self._lab.radio.send(bytes((packet.header,)) + bytes(packet.data))
 
-    def has_parameter(self, name: str) -> bool:
-        return name in self._parameters
+    def parameter_number(self, name: str) -> int | None:
+        return self._parameters.get(name)
 
     def has_log_variable(self, name: str) -> bool:
         return name in self._variables

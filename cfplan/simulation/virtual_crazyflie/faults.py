@@ -17,6 +17,7 @@ class VehicleFaultKind(StrEnum):
     BATTERY = "battery"  # the voltage under the present load falls to `size` V, and stays that much lower
     TUMBLE = "tumble"  # both left motors stop
     LOCK = "lock"  # the supervisor locks, for good
+    DECK = "deck"  # a deck reports a fault, which firmware from 2026.08 on obeys
     SILENT_ESTIMATE = "estimate log silent"  # blocks with the estimated position are not sent
     SILENT_STATUS = "status log silent"  # blocks with the supervisor's state are not sent
 

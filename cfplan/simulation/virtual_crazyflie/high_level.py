@@ -49,6 +49,7 @@ class PlannerState(Enum):
     IDLE = auto()
     FLYING = auto()
     LANDING = auto()
+    DISABLED = auto()  # by an app on board, or a curve that is not a number; until a setpoint from the radio
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,19 +132,28 @@ class HighLevelCommander:
         """Become idle at once."""
         self.state = PlannerState.IDLE
 
+    def disable(self) -> None:
+        """Send no setpoints any more, not even those that stop the motors."""
+        self.state = PlannerState.DISABLED
+
     def finished(self, time: float) -> bool:
         """Return whether the last curve has been flown to its end."""
         return time - self._begin >= sum(piece.duration for piece in self._pieces)
 
-    def setpoint(self, time: float) -> Setpoint:
-        """Return the setpoint of a time, s; called every 10 ms."""
+    def setpoint(self, time: float) -> Setpoint | None:
+        """Return the setpoint of a time, s, None if disabled; called every 10 ms."""
         if self.state is PlannerState.LANDING and self.finished(time):
             self.state = PlannerState.IDLE
         if self.state is PlannerState.IDLE:
             return Setpoint()
+        if self.state is PlannerState.DISABLED:
+            return None
         with np.errstate(all="ignore"):  # a client may send NaN
             goal = self._goal(time)
             body_rate = _body_rate(goal)
+        if np.isnan(goal.position[0]):  # all that the firmware looks at
+            self.disable()
+            return None
         self._last = goal
         setpoint = Setpoint(mode=np.array(ON_BOARD))
         setpoint.values[POSITION] = goal.position[:3]
@@ -190,7 +200,7 @@ class HighLevelCommander:
         return group == 0 or bool(group & self._group_mask)
 
     def _move(self, command: int, data: bytes, time: float) -> int:
-        if self.state is PlannerState.IDLE:
+        if self.state in (PlannerState.IDLE, PlannerState.DISABLED):
             self._last = self._where()
         if command in (_TAKE_OFF, _LAND):
             _, height, duration = unpack("<Bff", data)
@@ -218,7 +228,7 @@ class HighLevelCommander:
         return self._fly(_at_rest(self._last.position), target, yaw, duration, time, landing=landing)
 
     def _go_to(self, relative: bool, linear: bool, place: NDArray, duration: float, time: float) -> int:
-        here = self._last if self.state is PlannerState.IDLE else self._goal(time)
+        here = self._last if self.state in (PlannerState.IDLE, PlannerState.DISABLED) else self._goal(time)
         target = place + here.position if relative else place.copy()
         if linear:
             distance = target - here.position

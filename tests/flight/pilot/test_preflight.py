@@ -12,9 +12,17 @@ from cfplan.flight.firmware import GAIN_PARAMETERS, NEWEST_KNOWN, Timeouts, vers
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.deadlines import Lateness
 from cfplan.flight.pilot.health import GONE, Health
-from cfplan.flight.pilot.preflight import PreflightSnapshot, run_checks
+from cfplan.flight.pilot.preflight import PreflightSnapshot, firmware_check, run_checks
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_GROUPS, PARAMETER_RULES, Action, Traffic
-from cfplan.flight.radio.supervisor_bits import CAN_FLY, FLYING, HIGH_LEVEL_ACTIVE, LOCKED, TUMBLED
+from cfplan.flight.radio.supervisor_bits import (
+    CAN_FLY,
+    DECK_FAULT,
+    FLYING,
+    HIGH_LEVEL_ACTIVE,
+    HIGH_LEVEL_DISABLED,
+    LOCKED,
+    TUMBLED,
+)
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.defaults import DEFAULTS
@@ -84,10 +92,12 @@ def test_the_page_on_preflight_explains_every_line(ground):
         ("supervisor", {"could_fly": False}),
         ("supervisor", {"status": status(bits=CAN_FLY | LOCKED)}),
         ("supervisor", {"status": status(bits=CAN_FLY | TUMBLED)}),
+        ("supervisor", {"status": status(bits=CAN_FLY | DECK_FAULT)}),
         ("supervisor", {"status": status(bits=CAN_FLY | FLYING)}),
         ("battery at rest", {"status": status(voltage=3.8)}),
         ("battery at rest", {"status": status(voltage=math.nan)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY | HIGH_LEVEL_ACTIVE, (), setpoint=False)}),
+        ("other commanders", {"traffic": Traffic(CAN_FLY | HIGH_LEVEL_DISABLED, (), setpoint=False)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY, (7,), setpoint=False)}),
         ("other commanders", {"traffic": Traffic(CAN_FLY, (), setpoint=True)}),
         ("pose rate", {"poses": poses(rate=30.0)}),
@@ -109,6 +119,21 @@ def test_a_firmware_with_other_time_outs_is_refused_even_where_it_may_be_that_ol
     old = replace(mission.limits, firmware=replace(mission.limits.firmware, oldest=(2023, 2)))
     before = replace(ground, firmware="2023.02", mission=replace(mission, limits=old))
     assert failures(before) == ["supervisor's time-outs"]
+
+
+@pytest.mark.parametrize(
+    ("firmware", "deviates"),
+    [("2025.12.1", "5 to 9 cm"), ("2025.09.1", "8 to 13 cm"), ("2025.02", ""), ("2026.04", "")],
+)
+def test_a_firmware_that_deviates_more_than_dry_runs_say_flies_only_by_a_key_with_the_figure(firmware, deviates):
+    shipped = firmware_check(firmware, SHIPPED)
+    assert shipped.passed == (firmware == "2026.04")
+    assert f'oldest: "{firmware}"' in shipped.hint or not deviates
+    named = replace(SHIPPED, firmware=replace(SHIPPED.firmware, oldest=version_of(firmware)))
+    accepted = firmware_check(firmware, named)
+    assert accepted.passed
+    assert deviates in accepted.value
+    assert ("deviates" in accepted.value) == bool(deviates)
 
 
 def test_a_vehicle_that_does_not_tell_its_firmware_is_refused(ground):

@@ -125,9 +125,17 @@ def test_a_motor_test_turns_the_motors_of_an_armed_vehicle(rig):
     assert not rig.vehicle.stabilizer.loop.motors.any()
 
 
-def test_a_motor_test_does_nothing_to_a_vehicle_that_is_not_armed():
+@pytest.mark.parametrize("locked", [False, True])
+def test_a_motor_test_turns_the_motors_of_a_vehicle_that_is_disarmed_or_locked(locked):
     rig = Rig(VehicleSettings(auto_arming=False, stored={"motorPowerSet.enable": 1, "motorPowerSet.m1": 9000}))
+    if locked:
+        rig.vehicle.supervisor.emergency_stop()
     rig.run(1.0)
+    assert rig.vehicle.supervisor.locked == locked
+    assert not rig.vehicle.supervisor.armed
+    assert rig.vehicle.stabilizer.loop.motors.tolist() == [9000, 0, 0, 0]
+    rig.set("motorPowerSet.enable", 0)
+    rig.run(0.1)
     assert not rig.vehicle.stabilizer.loop.motors.any()
 
 

@@ -5,12 +5,16 @@ import struct
 import numpy as np
 import pytest
 
+from cfplan.flight.radio.restart import BOOT, POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
+from cfplan.flight.radio.supervisor_bits import DECK_FAULT, HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State, Supervisor
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.vehicle.airframes import AIRFRAMES
 
+PLANNER_IDLE = {"planner_active": False, "planner_finished": False, "planner_disabled": False}
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 RUNNING, OFF = np.full(4, 30000.0), np.zeros(4)
 
@@ -51,6 +55,36 @@ def test_a_brushless_vehicle_waits_for_a_request():
     assert hand.look(1.0)[-1] is State.CHECKS_PASSED
     assert hand.supervisor.request_arming(True)
     assert hand.look(0.08)[-1] is State.READY_TO_FLY
+
+
+def test_a_brushless_vehicle_flies_once_all_rotors_have_turned():
+    hand = Hand(auto_arming=False, checks_rotors=True)
+    hand.look(0.2)
+    assert hand.supervisor.request_arming(True)
+    assert set(hand.look(1.0)[1:]) == {State.ARMING}
+    states = hand.look(0.8, motors=np.full(4, 7000.0))
+    assert states.index(State.READY_TO_FLY) == pytest.approx(0.5 / 0.04, abs=1)
+
+
+def test_a_brushless_vehicle_whose_rotors_do_not_turn_is_disarmed_after_two_seconds():
+    hand = Hand(auto_arming=False, checks_rotors=True)
+    hand.look(0.2)
+    assert hand.supervisor.request_arming(True)
+    states = hand.look(2.5, motors=np.array([7000.0, 7000.0, 0.0, 7000.0]))
+    assert states.index(State.CHECKS_NOT_PASSED) == pytest.approx(2.0 / 0.04, abs=2)
+    assert not hand.supervisor.armed
+
+
+@pytest.mark.parametrize(
+    ("idle", "firmware", "flies"), [(7000, "2026.08", True), (0, "2026.08", False), (0, "2026.04", True)]
+)
+def test_idle_thrust_turns_the_rotors_that_arming_checks(idle, firmware, flies):
+    settings = VehicleSettings(firmware=firmware, stored={"powerDist.idleThrust": idle})
+    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1-brushless"], settings)
+    vehicle.advance(200)
+    assert vehicle.supervisor.request_arming(True)
+    vehicle.advance(1000)
+    assert vehicle.supervisor.can_fly == flies
 
 
 def test_the_airframe_says_whether_it_arms_itself():
@@ -102,7 +136,7 @@ def test_a_tilt_that_lasts_is_a_crash(acceleration, seconds):
     hand = Hand().fly()
     assert hand.look(seconds - 0.04, motors=RUNNING, acceleration=acceleration)[-1] is State.FLYING
     assert hand.look(0.16, motors=RUNNING, acceleration=acceleration)[-1] is State.CRASHED
-    assert hand.supervisor.info(planner_active=False, planner_finished=False) & 0x80
+    assert hand.supervisor.info(**PLANNER_IDLE) & 0x80
 
 
 def test_free_fall_is_no_crash():
@@ -151,9 +185,35 @@ def test_disarming_in_flight_stops_the_motors():
 def test_info_bits_are_those_that_cflib_knows():
     hand = Hand()
     hand.look(0.2)
-    assert hand.supervisor.info(planner_active=False, planner_finished=True) == 0b10_0000_1110
+    assert hand.supervisor.info(**PLANNER_IDLE | {"planner_finished": True}) == 0b10_0000_1110
     hand.look(0.1, motors=RUNNING)
-    assert hand.supervisor.info(planner_active=True, planner_finished=False) == 0b1_0001_1110
+    assert hand.supervisor.info(**PLANNER_IDLE | {"planner_active": True}) == 0b1_0001_1110
+
+
+def test_a_planner_that_is_given_no_number_is_disabled_until_a_setpoint_comes(hovering):
+    assert hovering.go_to(np.nan, 0.0, 1.0) == 0
+    hovering.run(0.1)
+    assert hovering.vehicle.info() & HIGH_LEVEL_DISABLED
+    assert not hovering.vehicle.info() & HIGH_LEVEL_ACTIVE
+    hovering.stream_hover(0.1)
+    assert not hovering.vehicle.info() & HIGH_LEVEL_DISABLED
+
+
+def test_the_fault_of_a_deck_keeps_a_vehicle_on_the_floor_and_locks_one_in_the_air(make_rig):
+    on_floor, in_air, old = make_rig(), make_rig(), make_rig(VehicleSettings(firmware="2026.04"))
+    for rig in (in_air, old):
+        rig.prepare()
+        rig.take_off()
+        rig.run(1.0)
+    for rig in (on_floor, in_air, old):
+        rig.vehicle.inject(VehicleFault(VehicleFaultKind.DECK, 0.0, 0.3))
+        rig.run(0.2)
+    assert on_floor.state is State.CHECKS_NOT_PASSED
+    assert on_floor.vehicle.info() & DECK_FAULT
+    assert in_air.state is State.LOCKED
+    assert old.state is State.FLYING  # it knows nothing of decks
+    on_floor.run(0.5)
+    assert on_floor.state is State.READY_TO_FLY
 
 
 def test_the_port_answers_arming_recovery_and_the_bits(make_rig):
@@ -165,6 +225,19 @@ def test_the_port_answers_arming_recovery_and_the_bits(make_rig):
     assert rig.send(Port.SUPERVISOR, 0, b"\x04")[0][1:] == b"\x84\x01"
     assert rig.send(Port.SUPERVISOR, 1, b"\x02")[0][1:] == b"\x82\x01\x01"
     assert rig.send(Port.SUPERVISOR, 1, b"\x01\x00")[0][1:] == b"\x81\x01\x00"
+
+
+def test_a_vehicle_that_is_restarted_answers_after_two_seconds_and_may_be_armed_before_three(rig):
+    rig.send(Port.LINK, POWER_CHANNEL, bytes((POWER, SYSTEM_OFF)))
+    rig.run(1.0)
+    rig.send(Port.LINK, POWER_CHANNEL, bytes((POWER, SYSTEM_ON)))
+    seen = []
+    rig.run(3.0, lambda _: seen.append((bool(rig.send(Port.LINK, 0, b"echo")), rig.state is State.READY_TO_FLY)))
+    answered, ready = np.array(seen).T
+    assert answered.argmax() / 100 == pytest.approx(1.9, abs=0.02)
+    assert ready.argmax() / 100 == pytest.approx(2.6, abs=0.1)
+    assert ready[-1]
+    assert ready.argmax() / 100 < BOOT
 
 
 def test_an_emergency_stop_packet_cuts_the_motors_in_flight(hovering):
