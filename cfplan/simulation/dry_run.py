@@ -1,4 +1,4 @@
-"""Dry run: the very bytes that will be sent, flown by the simulated vehicle before the flight.
+"""Dry run: fly exactly the bytes that will be sent on the simulated vehicle, before the flight.
 
 It starts in hover at the start, receives each payload when it is due and hovers on the last one; the controller sees
 the true state. Its motion is compared with the limits at which the pilot would brake.
@@ -26,21 +26,21 @@ from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.trajectory import Trajectory
 
 SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
-SETTLED = 0.02  # m, nearer than this to the end it has arrived
-ARRIVED = 0.05  # m, and no farther than this may it be at last
-_STRIDE = 5  # ms between the moments at which places are compared
+SETTLED = 0.02  # m from the end, within which the vehicle has settled
+ARRIVED = 0.05  # m from the end, the largest permitted final error
+_STRIDE = 5  # ms between compared positions
 _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What decides whether a dry run passes."""
+    """The figures by which a dry run passes or fails."""
 
     reason: str  # why it failed; empty when it passed
-    deviation: float  # m, worst distance from where the trajectory is at that time
-    deviation_time: float  # s, when that was
+    deviation: float  # m, largest distance from the trajectory at the same time
+    deviation_time: float  # s, when that occurred
     final_error: float  # m, from the end of the path when the simulation ends
-    speed: float  # m/s, highest that lasts for the limits' patience
+    speed: float  # m/s, highest value sustained for the limits' patience
     acceleration: float  # m/s², likewise
     angular_velocity: float  # rad/s, likewise
 
@@ -50,7 +50,7 @@ class Rehearsal:
         return not self.reason
 
     def require_passed(self) -> None:
-        """Raise NotCertifiedError where it failed."""
+        """Raise NotCertifiedError if it failed."""
         if self.reason:
             raise NotCertifiedError(self.reason, where="dry run", hint=_HINT)
 
@@ -60,10 +60,10 @@ class DryRun(Rehearsal):
     """The result of a dry run."""
 
     deviation_rms: float  # m, while it moves
-    path_distance: float  # m, worst distance from the path, whenever it is there
-    settle_time: float  # s, from the end of the motion until it stays within SETTLED; inf when it never does
-    saturation: float  # share of the time for which the motor that fares worst is at either end of its range
-    real_time_factor: float  # simulated seconds a second
+    path_distance: float  # m, largest distance from the path, at any time
+    settle_time: float  # s, from the end of the motion until the vehicle stays within SETTLED; inf: never
+    saturation: float  # fraction of the time that the most saturated motor is at either end of its range
+    real_time_factor: float  # simulated seconds per second
     loop: ClosedLoop  # the whole flight
 
     def __repr__(self) -> str:
@@ -71,14 +71,14 @@ class DryRun(Rehearsal):
         return f"<DryRun: {self.reason or 'passed'}, {off}>"
 
     def summary(self) -> dict[str, bool | float | str | None]:
-        """Return everything but the flight itself, for a file; a value that is not finite is None, as in JSON."""
+        """Return all figures without the flight itself, for a file; values that are not finite are None, as in JSON."""
         figures = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "loop"}
         return {"passed": self.passed} | {
             name: value if isinstance(value, str) or np.isfinite(value) else None for name, value in figures.items()
         }
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return everything but the flight itself, for people."""
+        """Return all figures without the flight itself, as labels and texts."""
         return [
             ("verdict", self.reason or "passed"),
             ("deviation in time", f"{100 * self.deviation:.1f} cm at {self.deviation_time:.2f} s"),
@@ -104,8 +104,8 @@ def dry_run(
 ) -> DryRun:
     """Fly the payloads on `airframe`; compare with `trajectory`.
 
-    `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover. The real-time factor
-    counts everything but the compilation at the first call ever.
+    `snapshot`, (31,), is the state of another flight, which this one continues instead of starting in hover. The
+    real-time factor leaves out compilation.
     """
     start = trajectory.at(0.0)
     begin = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot
@@ -122,7 +122,7 @@ def rehearse_setpoints(
 ) -> Rehearsal:
     """Fly payloads, (N, 29) uint8 at `rate`, Hz, on from a snapshot, (31,); compare with the places in them.
 
-    As dry_run() does, of a motion that is known by its setpoints alone; only what decides is looked at.
+    Like dry_run(), for a motion that is given by its setpoints alone; only the figures that decide are computed.
     """
     loop = fly_on(payloads, airframe, snapshot, rate)
     decoded, times = decode(payloads), np.arange(len(payloads)) / rate
@@ -132,7 +132,7 @@ def rehearse_setpoints(
 
 
 def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float = RATE) -> ClosedLoop:
-    """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
+    """Fly payloads, (N, 29) uint8 at `rate`, Hz, on from a snapshot, (31,); the last one is held."""
     times = np.arange(len(payloads)) / rate
     duration = times[-1] + SETTLING
     return fly_setpoints(decode(payloads), times, airframe, snapshot, duration)
@@ -176,13 +176,13 @@ def _judge(loop: ClosedLoop, wanted_at: Callable[[NDArray], NDArray], duration: 
 
 
 def _away(loop: ClosedLoop, wanted: NDArray) -> NDArray:
-    """Return (K,) m: how far the vehicle is from where it is wanted, (K, 3) m, each _STRIDE; inf where not known."""
+    """Return the distance from the desired position, (K, 3) m, each _STRIDE, (K,) m; inf if unknown."""
     error = np.linalg.norm(loop.position[::_STRIDE] - wanted, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
 
 def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehearsal:
-    """Return what decides; `error`, (K,) m, is the distance from where it is wanted."""
+    """Return the figures that decide; `error`, (K,) m, is the distance from the desired position."""
     worst, patience = int(np.argmax(error)), limits.patience
     changes = np.diff(loop.velocity, axis=0)
     run = Rehearsal(
@@ -198,7 +198,7 @@ def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehear
 
 
 def _fault(run: Rehearsal, limits: FlightLimits) -> str:
-    """Return the first reason not to fly, or nothing. A position that is not a number counts as infinitely far."""
+    """Return the first reason not to fly, or an empty text. A NaN position counts as infinitely far."""
     if not run.deviation < limits.deviation.brake:
         return (
             f"the vehicle strays {run.deviation:.2f} m from the trajectory at {run.deviation_time:.2f} s; "
