@@ -14,7 +14,7 @@ class Wish(StrEnum):
     EXTEND = "extend"  # fly on through these waypoints after those ahead
     REPLACE = "replace"  # fly through these instead
     STOP = "stop"  # come to rest soon, ahead on the path
-    SLOWER = "slower"  # fly what is ahead, and what is asked for later, at three quarters of the speed
+    SLOWER = "slower"  # fly the rest, and later requests, at three quarters of the speed
     FASTER = "faster"  # undo SLOWER
 
 
@@ -33,7 +33,7 @@ class PathVerdict(StrEnum):
 class PathRequest:
     """A request to change the path in flight."""
 
-    number: int  # by which its answer names it
+    number: int  # its answer has the same number
     wish: Wish
     waypoints: tuple[Triple, ...] = ()  # m
 

@@ -1,8 +1,8 @@
 """The firmware's Mellinger controller and power distribution, as crazyflie-firmware 2026.08 has them.
 
 Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors" (2011), with the firmware's
-integrators and its term on the change of body rates. Runs at 500 Hz, on one lane of a batch (see `layout`), of which it
-reads the setpoint and updates its memory:
+integrators and its term on the change of body rates. Runs at 500 Hz on one lane of a batch (see `layout`), in
+which it reads the setpoint and updates the memory:
 
     setpoint (20)   position 0:3, velocity 3:6, acceleration 6:9, quaternion 9:13 x y z w, body rate 13:16 rad/s
                     (right-handed body axes), roll, pitch, yaw 16:19 rad (the firmware's legacy signs: pitch up is

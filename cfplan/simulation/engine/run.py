@@ -270,7 +270,7 @@ def _read_snapshot(snapshot: NDArray, lanes: NDArray, n: int) -> None:
 
 @njit(allocates=False, error_model="numpy")
 def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
-    """Let all estimates miss what an error of acceleration makes of so many s without poses."""
+    """Set the errors of all estimates from an error of acceleration over `blind_for`, s without poses."""
     count = min(count, WIDTH)  # the compiler must see that no index overflows
     for n in range(count):
         x, y, z = vector(lanes, WIDTH, n, _BLIND)
@@ -281,7 +281,7 @@ def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
 
 @register_jitable
 def _err(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
-    """Let all estimates be late and noisy besides."""
+    """Add latency and noise to the errors of all estimates."""
     seen = max(k - schedule.latency // schedule.step, 0)
     for n in range(lanes.size):
         for row in range(6):
