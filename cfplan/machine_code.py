@@ -1,11 +1,11 @@
-"""Machine code by numba, kept for the next process under one key over all sources.
+"""Compile functions by numba, and cache the machine code for later processes under one key over all sources.
 
-Modules take `njit` from here. numba keeps what it compiles in files: one index for each function, by the types of its
-arguments and the processor. Here these files lie in a folder named by a hash of cfplan's sources and of the versions
-of the compilers, so none can be out of date. Where the folder cannot be written, each process compiles for itself.
+Modules import `njit` from here. numba caches compiled code in files, with an index for each function by argument types
+and processor. Here these files lie in a folder named by a hash of cfplan's sources and the versions of the compilers,
+so none can be out of date. If the folder cannot be written, each process compiles for itself.
 
-Loading is numba's but for two things that it does at once and that only compiling needs: it imports its compiler, and
-parses the bitcode of every function. Without them `cfplan plan` starts 0.5 s sooner.
+Loading is numba's own, without two steps that only compilation needs: importing numba's compiler, and parsing the
+bitcode of every function. Without them `cfplan plan` starts 0.5 s sooner.
 """
 
 import fcntl
@@ -34,12 +34,12 @@ from numba.core.registry import cpu_target
 from numba.core.runtime._nrt_python import c_helpers
 
 PACKAGE = Path(__file__).parent
-LEAVES = ("cli", "steering", "air", "preparation")  # rooms on which no compiled function depends
+LEAVES = ("cli", "steering", "air", "preparation")  # packages on which no compiled function depends
 _KEPT_DAYS = 60.0
 
 
 def cache_folder() -> Path:
-    """Return where compiled code is kept: CFPLAN_CACHE, or the platform's cache folder."""
+    """Return the folder for compiled code: CFPLAN_CACHE, or the platform's cache folder."""
     if chosen := os.environ.get("CFPLAN_CACHE"):
         return Path(chosen)
     if sys.platform == "darwin":
@@ -48,7 +48,7 @@ def cache_folder() -> Path:
 
 
 def hash_of_sources() -> str:
-    """Return the hash of all that compiled code depends on but for the processor."""
+    """Return the hash of all that compiled code depends on, except the processor."""
     versions = numba.__version__, llvmlite.__version__, np.__version__, platform.python_version()
     found = hashlib.sha256(repr(versions).encode())
     for file in sorted(PACKAGE.rglob("*.py")):
@@ -58,11 +58,11 @@ def hash_of_sources() -> str:
     return found.hexdigest()[:20]
 
 
-KEY = hash_of_sources()  # as this process began
+KEY = hash_of_sources()  # when this process began
 
 
 def code_folder() -> Path:
-    """Return the folder of the code that these sources compile to."""
+    """Return the folder of the code compiled from these sources."""
     return cache_folder() / KEY
 
 
@@ -77,17 +77,17 @@ def _writable(folder: Path) -> bool:
 
 
 def cache_writable() -> bool:
-    """Return whether compiled code can be kept."""
+    """Return whether compiled code can be cached."""
     return _writable(code_folder())
 
 
 def count_functions() -> int:
-    """Return how many functions are kept, one for each set of argument types."""
+    """Return how many functions are cached, counting each set of argument types."""
     return sum(1 for _ in code_folder().glob("*.nbc"))
 
 
 def delete_unused() -> None:
-    """Delete the code of sources that no process has run for a long time."""
+    """Delete the code of sources that no process has used for a long time."""
     oldest = time.time() - _KEPT_DAYS * 86400
     for lock in cache_folder().glob("*/lock"):
         if lock.stat().st_mtime < oldest:
@@ -95,7 +95,7 @@ def delete_unused() -> None:
 
 
 class _Locator(UserProvidedCacheLocator):
-    """Names the files of a function."""
+    """Names the cache files of a function."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file, self._folder = file, str(code_folder())
@@ -123,24 +123,24 @@ class _Cache(FunctionCache):
 
     @contextmanager
     def _locked(self) -> Iterator[None]:
-        """Let one process at a time read or write an index and what it names; a file system may know no locks."""
+        """Lock an index and the files that it names, if the file system has locks."""
         with Path(self.cache_path, "lock").open("ab") as file:
             with suppress(OSError):
                 fcntl.flock(file, fcntl.LOCK_EX)
             yield
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the compiled function, or None if it is not kept, without importing numba's compiler."""
+        """Return the compiled function, or None if it is not cached, without importing numba's compiler."""
         with self._locked():
             try:
                 return self._load_overload(sig, target_context)
-            except (EOFError, UnpicklingError):  # a damaged file, as a power cut may leave
+            except (EOFError, UnpicklingError):  # a damaged file, for instance after a power cut
                 self.flush()
                 return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled function, unless sources have changed since this process began; a full disk is no error."""
-        _listener.on_start(None)  # this takes time as compiling does
+        """Cache a compiled function, unless sources have changed since this process began; a full disk is no error."""
+        _listener.on_start(None)  # this counts as compiling
         try:
             if hash_of_sources() == KEY:
                 with suppress(OSError), self._locked():
@@ -177,14 +177,14 @@ class _Library(JITCodeLibrary):
         return library
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Return the address of a function, 0 if it is not here."""
+        """Return the address of a function, 0 if the library does not have it."""
         if not self._object:
             return int(super().get_pointer_to_function(name))
         return int(self._codegen._engine.get_function_address(name)) if name.encode() in self._object else 0
 
 
 def _environment(module: str, constants: list[Any], name: str) -> environment.Environment:
-    """Return the environment of a compiled function; its globals are for code that was not compiled."""
+    """Return the environment of a compiled function; its globals matter only to code that is not compiled."""
     made = environment.lookup_environment(name)
     if made is None:
         made = environment.Environment(vars(sys.modules[module]) if module in sys.modules else {"__name__": module})
@@ -195,13 +195,13 @@ def _environment(module: str, constants: list[Any], name: str) -> environment.En
 
 
 cpu_target.target_context.codegen()._library_class = _Library
-environment._rebuild_env = _environment  # numba's imports the module
-for _helper, _address in c_helpers.items():  # which numba adds where it imports its compiler
+environment._rebuild_env = _environment  # numba's own imports the module
+for _helper, _address in c_helpers.items():  # numba adds these when it imports its compiler
     llvm.add_symbol(_helper if _helper.startswith("_") else f"NRT_{_helper}", _address)
 
 
 class _Compiling(event.Listener):
-    """Keeps the garbage collector from walking through a compiler's millions of objects again and again."""
+    """Suspends garbage collection during compilation, which makes millions of objects."""
 
     depth = 0
     collector_was_on = False
@@ -237,21 +237,21 @@ def time_without_compiling() -> float:
 
 
 def njit(function: Callable[..., Any] | None = None, *, allocates: bool = True, **options: Any) -> Any:
-    """Compile a function at its first call for each set of argument types, as numba.njit does, and keep the result.
+    """Compile a function at its first call for each set of argument types, like numba.njit, and cache the result.
 
-    A function that makes no arrays and returns none may say so with `allocates=False`: it then counts no references to
-    those that it is given, which is half of the time of a step of the simulated vehicle.
+    Use `allocates=False` for a function that neither makes nor returns arrays: it then counts no references to its
+    arguments, which halves the time of a step of the simulated vehicle.
     """
     if function is None:
         return lambda each: njit(each, allocates=allocates, **options)
     made: Any = numba.njit(**{"_nrt": allocates, "no_cfunc_wrapper": True, **options})(function)
-    with_source = os.path.exists(function.__code__.co_filename)  # else it was typed in
+    with_source = os.path.exists(function.__code__.co_filename)  # else it was typed interactively
     if hasattr(made, "_cache") and with_source and cache_writable():  # numba may be switched off
         made._cache = _Cache(function)
     return made
 
 
 def vector_width() -> int:
-    """Return how many doubles a register of the processor to compile for holds."""
+    """Return how many doubles a vector register of the target processor holds."""
     features = cpu_target.target_context.codegen().magic_tuple()[2].split(",")
     return 8 if "+avx512f" in features else 4 if "+avx" in features else 2

@@ -1,6 +1,6 @@
-"""Background checks, by a thread or by a process, which the interpreter's lock does not hold up.
+"""Background checks in a thread, or in a separate process that does not compete for the interpreter's lock.
 
-A thread does them unless this process has started another for that. Where that has died, they are done here.
+They run in a thread unless this process has started a process for them. If that process has died, the caller runs them.
 """
 
 import contextlib
@@ -10,28 +10,28 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any, Protocol
 
-Check = Callable[[], Any]  # as functools.partial makes it, which goes from process to process
+Check = Callable[[], Any]  # a functools.partial, which can be pickled
 
 
 class Pending(Protocol):
-    """A check that is being done."""
+    """A check that is running or queued."""
 
     def result(self) -> Any:
-        """Wait for what it returns or raises."""
+        """Wait for the check; return its value or raise its error."""
 
     def exception(self) -> BaseException | None:
-        """Wait for what it raises."""
+        """Wait for the check; return the error that it raised, if any."""
 
 
 class BackgroundChecks(Protocol):
-    """A thread or a process that does checks."""
+    """A thread or a process that runs checks."""
 
     def begin(self, *checks: Check) -> list[Pending]:
-        """Begin to do one after another, once those begun before are done."""
+        """Queue checks, which run one after another behind those queued before."""
 
 
 class ChecksByThread:
-    """A thread of this process."""
+    """Runs checks in a thread of this process."""
 
     def __init__(self) -> None:
         self._pool = ThreadPoolExecutor(1, "checks")
@@ -41,10 +41,10 @@ class ChecksByThread:
 
 
 class ChecksByProcess:
-    """A process of its own; it ends with this one, whatever that dies of."""
+    """Runs checks in a separate process, which ends when this one does, however it ends."""
 
     def __init__(self, prepare: Callable[[], None]):
-        """Start it; there it calls `prepare` first."""
+        """Start the process, which first calls `prepare`."""
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         context.Process(target=_serve, args=(other, prepare), name="checks", daemon=True).start()
@@ -53,7 +53,7 @@ class ChecksByProcess:
 
     def begin(self, *checks: Check) -> list[Pending]:
         if self._last is not None:
-            self._last.exception()  # else both might wait until the other reads
+            self._last.exception()  # else each side might block until the other reads
         with contextlib.suppress(OSError):
             self._pipe.send(checks)
         answers: list[Pending] = []
@@ -64,7 +64,7 @@ class ChecksByProcess:
 
 
 class _Answer:
-    """The outcome of a check, behind that of the one before."""
+    """The outcome of a check, read from the pipe after those of the checks before it."""
 
     def __init__(self, pipe: Connection, check: Check, before: "_Answer | None"):
         self._pipe, self._check, self._before = pipe, check, before
@@ -92,7 +92,7 @@ class _Answer:
 
 
 def _done(check: Check) -> tuple[Any, BaseException | None]:
-    """Return what a check returns, and what it raises."""
+    """Run a check; return its value, or the error that it raised."""
     try:
         return check(), None
     except Exception as error:
@@ -100,7 +100,7 @@ def _done(check: Check) -> tuple[Any, BaseException | None]:
 
 
 def _serve(pipe: Connection, prepare: Callable[[], None]) -> None:
-    """Do the checks that come until the other process has ended."""
+    """Run incoming checks until the other process has ended."""
     with contextlib.suppress(EOFError, OSError):
         prepare()
         while True:
@@ -112,11 +112,11 @@ _checks: BackgroundChecks = ChecksByThread()
 
 
 def background_checks() -> BackgroundChecks:
-    """Return what does checks for this process."""
+    """Return the thread or process that runs checks for this process."""
     return _checks
 
 
 def do_checks_by(other: BackgroundChecks) -> None:
-    """Let another do the checks of this process from now on."""
+    """Run the checks of this process in another thread or process from now on."""
     global _checks
     _checks = other

@@ -1,8 +1,8 @@
-"""Certify a flight that goes on from one that is flown: bytes, stops, link loss, gaps and the dry run.
+"""Certify a flight that continues the present one: bytes, stops, link loss, gaps and the dry run.
 
-All of it may be certified, or its beginning alone, with the stop behind that: what a pilot is bound to then ends at
-rest too, and takes as little time to certify as the beginning is short. More of the flight replaces the stop before the
-vehicle gets there. The first setpoint is the committed one, to the byte: it was certified with its own look-ahead.
+Either the whole flight is certified, or only its beginning with a stop behind it: that commitment ends at rest too, and
+a short beginning takes little time to certify. More of the flight replaces the stop before the vehicle reaches it. The
+first setpoint is the committed one, to the byte: it was certified with its own look-ahead.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,11 +32,11 @@ from cfplan.vehicle.joint import JoinedTrajectory
 
 STOP = round(DURATION * RATE)  # setpoints from the place where a stop begins to where it rests
 BEHIND = STOP + 1 + round(HOLD * RATE)  # setpoints of a beginning behind those that follow the motion
-_FORESEEN = 0.05  # m beyond a wall, from which on link loss that is only foreseen counts
+_FORESEEN = 0.05  # m beyond a wall; if link loss is only estimated, less than this is ignored
 
 
 class EndsBadlyError(InfeasibleError):
-    """After link loss or a gap the vehicle would end outside the walls, or turn over."""
+    """Link loss or a gap would take the vehicle outside the walls, or turn it over."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,25 +46,25 @@ class CertifiedFlight:
     payloads: NDArray  # (N, 29) uint8
     stops: NDArray  # (N, M, 29) uint8
     snapshots: NDArray  # (L, N, 31), the simulated vehicle at each setpoint, for each motor lag
-    following: int | None  # how many of the setpoints follow the motion, before the stop; None where all do
-    rest: tuple[Triple, float] | None = None  # m, rad: place and yaw where that stop rests
+    following: int | None  # number of setpoints that follow the motion, before the stop; None: all do
+    rest: tuple[Triple, float] | None = None  # m, rad: place and yaw at which that stop ends
 
     @property
     def ending(self) -> int:
-        """Return how many of the stops, the last ones, are what is left of the stop before them."""
+        """Return the number of stops at the end that are only the remainder of the stop before them."""
         return 0 if self.following is None else len(self.payloads) - self.following - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Onward:
-    """A motion that goes on from a setpoint."""
+    """A motion that continues from a setpoint."""
 
     motion: JoinedTrajectory  # its clock is 0 at that setpoint
     starts: NDArray | None = None  # (L, 31) the simulated vehicle there, for each motor lag; None: it hovers
-    committed: NDArray | None = None  # (29,) uint8, that setpoint as it is committed; None where none is
+    committed: NDArray | None = None  # (29,) uint8, that setpoint as committed; None if nothing is committed
 
     def encoded(self, limits: Limits, count: int | None = None) -> EncodedFlight:
-        """Return its setpoints, the first of which is the committed one; so many at most, or all."""
+        """Return its setpoints, at most `count` of them; the first is the committed one."""
         encoded = encode_trajectory(self.motion, gains=gains_under(limits), space=limits.space, count=count)
         if self.committed is None:
             return encoded
@@ -73,14 +73,14 @@ class Onward:
         return replace(encoded, payloads=payloads, decoded=decode(payloads))
 
     def to_check(self, encoded: EncodedFlight) -> EncodedFlight:
-        """Return the setpoints that are made of this motion: all but the committed one."""
+        """Return the setpoints that were made from this motion: all but the committed one."""
         return encoded if self.committed is None else _rows(encoded, slice(1, None))
 
 
 def certify_whole(onward: Onward, limits: Limits) -> CertifiedFlight:
-    """Certify all of a flight like a plan before take-off.
+    """Certify a whole flight like a plan before take-off.
 
-    Raises EndsBadlyError or NotCertifiedError where it does not pass.
+    Raises EndsBadlyError or NotCertifiedError if it does not pass.
     """
     encoded, motion = onward.encoded(limits), onward.motion
     believed = None if onward.starts is None else as_believed(onward.starts, limits)
@@ -96,17 +96,17 @@ def certify_whole(onward: Onward, limits: Limits) -> CertifiedFlight:
 
 
 def certify_beginning(onward: Onward, following: int, limits: Limits, *, foresee: bool = True) -> CertifiedFlight:
-    """Certify so many setpoints of a flight in motion, and the stop behind them; all of it where that is hardly more.
+    """Certify the first `following` setpoints of a flight in motion and the stop behind them.
 
-    As certify_whole(). With `foresee`, an estimate of link loss in all of the flight counts besides: what it says to
-    end outside by far is refused before any of it is flown.
+    A flight that is hardly longer than that is certified whole. Raises as certify_whole() does. With `foresee`, link
+    loss is also estimated for the rest of the flight, which is refused if that would end far outside the walls.
     """
     if following + STOP >= onward.motion.duration * RATE:
         return certify_whole(onward, limits)
     starts = onward.starts
     assert starts is not None
     foresee = foresee and not limits.link_loss.only_warn
-    encoded = onward.encoded(limits, None if foresee else following + STOP)  # stops lead half as far on
+    encoded = onward.encoded(limits, None if foresee else following + STOP)  # enough: stops advance half as far
     foreseen = [partial(foresee_link_loss, encoded.payloads, limits, starts)] if foresee else []
     beginning = _Beginning.of(encoded, following)
 
@@ -120,17 +120,17 @@ def certify_beginning(onward: Onward, following: int, limits: Limits, *, foresee
 
 
 class _Beginning(NamedTuple):
-    """So many setpoints of a flight as are to be certified, and the stop behind them."""
+    """The first setpoints of a flight, which are to be certified, and the stop behind them."""
 
     payloads: NDArray  # (N, 29) uint8, with the stop and the hover behind it
-    encoded: EncodedFlight  # before the stop
-    motion: FullStateSetpoints  # as far as stops from them lead
+    encoded: EncodedFlight  # the setpoints before the stop
+    motion: FullStateSetpoints  # as far as the stops from those setpoints reach
     stop: NDArray  # (M, 29) uint8
-    rest: tuple[Triple, float]  # m, rad: where that rests
+    rest: tuple[Triple, float]  # m, rad: place and yaw at which the stop ends
 
     @classmethod
     def of(cls, encoded: EncodedFlight, following: int) -> "_Beginning":
-        """Return it, from the setpoints of a flight, as many as its stops lead on at least."""
+        """Return the beginning of an encoded flight, which must reach as far as the stops from it do."""
         motion, gains, space = _motion_rows(encoded.motion, slice(following + STOP)), encoded.gains, encoded.space
         stop = encode_stops(motion, RATE, rows=np.array([following]), gains=gains, space=space)[0]
         hovering = np.repeat(stop[-1:], BEHIND - len(stop), axis=0)
@@ -139,7 +139,7 @@ class _Beginning(NamedTuple):
         return cls(payloads, begun, motion, stop, rest_behind(motion, following, RATE))
 
     def certified(self, stops: NDArray, snapshots: NDArray) -> CertifiedFlight:
-        """Return it certified, with the stops from its setpoints before the stop, (K, M, 29)."""
+        """Return the certified flight; `stops`, (K, M, 29), are those from the setpoints before the stop."""
         behind = left_of(self.stop, BEHIND - 1)
         following = len(stops) - 1
         return CertifiedFlight(self.payloads, np.concatenate([stops, behind]), snapshots, following, self.rest)
@@ -168,11 +168,11 @@ def _certified(
 ) -> tuple[NDArray, LinkLossMoments]:
     """Return a stop from each setpoint of `encoded`, and link loss of `payloads`, which begin with those setpoints.
 
-    `motion` is that of the setpoints behind them too, where the stops lead along it. Raises as certify_whole() does,
-    and what `check` raises, and first what is `foreseen`.
+    `motion` also covers the setpoints after these, if the stops reach that far. Raises as certify_whole() does, and
+    whatever `check` raises; errors of the checks in `foreseen` come first.
     """
 
-    # What is mostly compiled loops goes on beside what is mostly Python: two threads of that would hinder each other.
+    # Compiled loops run beside code that is mostly Python: two threads of Python would hold each other up.
     losing, *others = background_checks().begin(
         partial(link_loss_at_walls, payloads, limits, starts=starts),
         partial(meet_gaps, payloads, limits, starts),
@@ -188,7 +188,7 @@ def _certified(
         refused = error
     finally:
         for each in (losing, *others):
-            each.exception()  # nothing goes on behind the caller's back
+            each.exception()  # no check may outlast this call
     for each in reversed(others):
         each.result()
     if refused is not None:
@@ -205,7 +205,7 @@ def _stops_along(encoded: EncodedFlight, motion: FullStateSetpoints, limits: Lim
 
 
 def _require_all_inside(encoded: EncodedFlight, stops: NDArray, limits: Limits, lost: LinkLossMoments) -> None:
-    """Raise EndsBadlyError where link loss ends outside the walls, also while the vehicle flies one of the stops."""
+    """Raise EndsBadlyError if link loss ends outside the walls, also during any of the stops."""
     require_inside(lost, limits)
     if limits.link_loss.only_warn:
         return
@@ -216,20 +216,20 @@ def _require_all_inside(encoded: EncodedFlight, stops: NDArray, limits: Limits, 
 
 
 def require_inside(lost: LinkLossMoments, limits: Limits) -> None:
-    """Raise EndsBadlyError where link loss ends outside the walls."""
+    """Raise EndsBadlyError if link loss ends outside the walls."""
     if not inside(lost.worst.beyond) and not limits.link_loss.only_warn:
         raise EndsBadlyError(str(lost.worst), where="link loss", hint=OUTSIDE_HINT)
 
 
 def foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> None:
-    """Raise EndsBadlyError where link loss is foreseen to end outside the walls by far."""
+    """Raise EndsBadlyError if link loss is estimated to end far outside the walls."""
     foreseen = foreseen_link_loss(payloads, limits, starts=starts).worst
     if not inside(foreseen.beyond, _FORESEEN):
         raise EndsBadlyError(str(foreseen), where="link loss", hint=OUTSIDE_HINT)
 
 
 def meet_gaps(payloads: NDArray, limits: Limits, starts: NDArray | None) -> None:
-    """Raise EndsBadlyError where a gap in setpoints or poses loses the vehicle."""
+    """Raise EndsBadlyError if the vehicle is lost after a gap in setpoints or poses."""
     believed = None if starts is None else as_believed(starts, limits)
     glitches = glitch_at_sampled_setpoints(payloads, limits, start=believed)
     if glitches.lost.any():

@@ -1,8 +1,8 @@
-"""The core of planning in the air: a state, events, and the effects that each event has. It knows no clock or process.
+"""The core of planning in the air: a state, events, and the effects of each event, without clocks or processes.
 
-One proposal at most is being made, and one at most is with the pilot. The latest request wins: one that waits is
-superseded when another comes. A proposal that comes too late is made again, from farther ahead. Where the
-pilot does not answer, requests are refused until it does, since what it is committed to is not known.
+At most one proposal is being made, and at most one is with the pilot. The latest request wins: a waiting request is
+superseded when another arrives. A proposal that comes too late is made again from farther ahead. While the pilot does
+not answer, requests are refused, because its commitment is not known.
 
     Asked, Answered, Made, Begun; or time passes  →  step()  →  the next state, and Make, Propose, Tell
 """
@@ -25,15 +25,15 @@ from cfplan.safety.limits import Limits
 NOT_FLOWN = "the plan is not flown yet"
 NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
 ON_ITS_WAY = "the vehicle is there, or on its way there already"
-PILOT_ANSWER_TIMEOUT = 1.0  # s in which a pilot answers; what comes later counts as well
-FIRST_PART, NEXT_PART = 0.3, 0.8  # s of a plan committed at once, at least: its beginning, and more of it
-PART = 4.0  # likewise, for each s that planning looks ahead
-NEAR = 0.5  # s before the next part must be planned, from when on that is done
-QUIET = 1.0  # s without a request, after which more of a plan is committed than is near: others may replace it soon
-FARTHEST = 30.0  # s ahead of which no more of it is committed even then
-ON_THE_WAY = 0.001  # s that a proposal takes to the pilot, at least
-LEARNED_FROM, IN_TIME = 15, 0.8  # jobs, by which the time that the next takes is known: that quantile of theirs
-TRIES, LATER = 3, 2.0  # of a request whose proposals come too late; times as far ahead, from where the next is made
+PILOT_ANSWER_TIMEOUT = 1.0  # s to wait for the pilot's answer; a later answer still counts
+FIRST_PART, NEXT_PART = 0.3, 0.8  # s, least duration of the first part of a plan, and of each later part
+PART = 4.0  # s of part per s of planning look-ahead, if that is longer
+NEAR = 0.5  # s before the next part must be planned, at which planning it begins
+QUIET = 1.0  # s without a request, after which parts are planned far ahead: no request is likely to replace them
+FARTHEST = 30.0  # s, how far ahead parts are then committed at most
+ON_THE_WAY = 0.001  # s, least time in which a proposal reaches the pilot
+LEARNED_FROM, IN_TIME = 15, 0.8  # recent jobs of a kind; the quantile of their durations that predicts the next
+TRIES, LATER = 3, 2.0  # attempts per request if proposals come late; factor on the look-ahead of the next
 
 
 # Events.
@@ -41,14 +41,14 @@ TRIES, LATER = 3, 2.0  # of a request whose proposals come too late; times as fa
 
 @dataclass(frozen=True, slots=True)
 class Begun:
-    """The pilot has begun to fly; setpoint 0 is due at `start`, s."""
+    """The pilot has begun to stream; setpoint 0 is due at `start`, s."""
 
     start: float
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A request has come."""
+    """A request has arrived."""
 
     request: PathRequest
 
@@ -58,30 +58,30 @@ class Answered:
     """The pilot has answered a proposal."""
 
     proposal: int  # checksum
-    commitment: int | None  # checksum of what is committed with it; None where it was refused
-    came: float  # s, when the pilot had the proposal; 0 where that is not known
+    commitment: int | None  # checksum of the commitment with it; None if it was refused
+    came: float  # s, when the pilot received the proposal; 0 if unknown
     reason: str = ""  # why it was refused
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """To plan what a request asks for, or the next part of a plan where there is none, from a setpoint on."""
+    """A planning job from a setpoint on: a request, or without one the next part of the plan."""
 
     request: PathRequest | None
-    received: float  # s, when the request came
+    received: float  # s, when the request arrived
     begun: float  # s
-    ahead: float  # s from then on, in which its proposal is taken to be with the pilot
+    ahead: float  # s after `begun` by which its proposal is expected to reach the pilot
     splice: int  # setpoint
     part: int  # setpoints to commit at once
-    tries: int = 1  # with this one; the proposals of those before came too late
+    tries: int = 1  # attempts, this one included; the proposals of the others came too late
 
     @property
     def kind(self) -> str:
-        """Return by what it is known how long the job takes."""
+        """Return the kind of job, by which durations are recorded."""
         return "part" if self.request is None else "stop" if self.request.wish is Wish.STOP else "plan"
 
     def outcome(self, timeline: Timeline, limits: Limits) -> "Made":
-        """Do the job. A fault here must not leave the rest of the flight without a planner, so nothing is raised."""
+        """Do the job. Raises nothing: a fault must not leave the rest of the flight without a planner."""
         try:
             if self.request is None:
                 return Made(self, next_part(timeline, self.splice, limits, self.part))
@@ -97,7 +97,7 @@ class Made:
     """A job is done."""
 
     job: Job
-    result: Replanned | Timeline | str  # the timeline where nothing need be proposed; why there is neither
+    result: Replanned | Timeline | str  # the timeline if nothing need be proposed; why planning failed
 
 
 Event = Begun | Asked | Answered | Made
@@ -108,7 +108,7 @@ Event = Begun | Asked | Answered | Made
 
 @dataclass(frozen=True, slots=True)
 class Make:
-    """Do a job on the present timeline."""
+    """Do this job on the present timeline."""
 
     job: Job
 
@@ -137,51 +137,51 @@ class Sent:
     job: Job
     made: Replanned
     sent: float  # s
-    behind: Replanned | None = None  # to be proposed next, where this is the stop before it
+    behind: Replanned | None = None  # to be proposed next, if this is the stop before it
     stop: int = 0  # checksum of the stop before it
     unanswered: bool = False  # for longer than PILOT_ANSWER_TIMEOUT
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoreState:
-    """What the planner knows."""
+    """The planner's state."""
 
     timeline: Timeline
-    took: dict[str, tuple[float, ...]]  # s that the last jobs of each kind took until the pilot had their proposals
+    took: dict[str, tuple[float, ...]]  # s that recent jobs of each kind took until the pilot had their proposals
     begun: float = math.nan  # s, when setpoint 0 is due
-    waiting: tuple[PathRequest, float] | None = None  # the latest request, and when it came, s
-    asked: float = -math.inf  # s, when the last request came
-    job: Job | None = None  # that is being done
+    waiting: tuple[PathRequest, float] | None = None  # the latest request, and when it arrived, s
+    asked: float = -math.inf  # s, when the last request arrived
+    job: Job | None = None  # the job under way
     sent: Sent | None = None
-    accepted: int = 0  # number of the request whose plan is flown
+    accepted: int = 0  # number of the request whose plan is being flown
 
     def ahead(self, kind: str) -> float:
-        """Return how far ahead to plan, s, for most jobs of a kind to be in time."""
+        """Return how far ahead to plan, s, so that most jobs of a kind are in time."""
         return float(np.quantile(self.took[kind], IN_TIME)) + ON_THE_WAY
 
     def first(self, now: float, ahead: float) -> int:
-        """Return the setpoint from which on a plan is in time that is proposed `ahead`, s, from now."""
+        """Return the earliest splice of a plan that is proposed `ahead`, s, from now."""
         return math.ceil((now - self.begun + ahead + LOOKS_UNTIL) * RATE) - 1 + LEAST_AHEAD
 
     def learned(self, kind: str, took: float) -> "CoreState":
-        """Return the state that knows how long one more job took, s."""
+        """Return the state with one more recorded job duration, s."""
         return replace(self, took=self.took | {kind: (*self.took[kind], took)[-LEARNED_FROM:]})
 
     @property
     def wakes(self) -> float | None:
-        """Return when something is to be done though nothing happens, s from now; None: never."""
+        """Return when step() must be called again even without events, s from now; None: never."""
         if self.sent is not None:
             return PILOT_ANSWER_TIMEOUT
         return 1.0 / RATE if self.timeline.unfinished else None
 
 
 def first_state(timeline: Timeline, plan: float, stop: float) -> CoreState:
-    """Return the state before the flight; plans and stops are taken to need so long, s, until any was made."""
+    """Return the state before the flight; `plan` and `stop`, s, are durations to assume for the first jobs."""
     return CoreState(timeline, {"plan": (plan,), "stop": (stop,), "part": (stop,)})
 
 
 def step(state: CoreState, events: Sequence[Event], now: float, limits: Limits) -> tuple[CoreState, list[Effect]]:
-    """Return the state after events at `now`, s, in order, none where time has passed, and their effects, in order."""
+    """Return the state after the events, in order, and their effects; without events only time has passed, to `now`."""
     effects: list[Effect] = []
     for event in events:
         state, more = _after(state, event, now, limits)
@@ -207,7 +207,7 @@ def _after(state: CoreState, event: Event, now: float, limits: Limits) -> tuple[
 
 
 def _next(state: CoreState, now: float) -> tuple[CoreState, list[Effect]]:
-    """Return the next job if none is under way, and no proposal with the pilot."""
+    """Begin the next job unless one is under way or a proposal is with the pilot."""
     if state.job is not None:
         return state, []
     if state.sent is not None and not state.sent.unanswered and now < state.sent.sent + PILOT_ANSWER_TIMEOUT:
@@ -232,7 +232,7 @@ def _next(state: CoreState, now: float) -> tuple[CoreState, list[Effect]]:
 def _begin(
     state: CoreState, request: PathRequest | None, received: float, now: float, ahead: float, tries: int = 1
 ) -> tuple[CoreState, list[Effect]]:
-    """Return the state with a job that looks so far ahead, s; its part ends well after the next one can be made."""
+    """Begin a job that looks `ahead`, s; its part is long enough for the next one to be made meanwhile."""
     part = round(max(NEXT_PART if request is None else FIRST_PART, PART * ahead) * RATE)
     splice = max(state.first(now, ahead), state.timeline.begin)
     job = Job(request, received, now, ahead, splice, part, tries)
@@ -240,7 +240,7 @@ def _begin(
 
 
 def _wants_more(state: CoreState, now: float) -> bool:
-    """Return whether more of a plan is to be committed."""
+    """Return whether the next part of a plan should be planned now."""
     timeline, within = state.timeline, NEAR if now - state.asked < QUIET else FARTHEST
     if math.isnan(state.begun) or not timeline.unfinished:
         return False
@@ -248,7 +248,7 @@ def _wants_more(state: CoreState, now: float) -> bool:
 
 
 def _presses(state: CoreState, now: float) -> bool:
-    """Return whether more of a plan must be committed before a request is planned, so as to be in time."""
+    """Return whether the next part must be planned before a waiting request, so as to be in time."""
     ends = state.timeline.part_ends
     return ends is not None and ends < state.first(now, state.ahead("plan") + 2.0 * state.ahead("part"))
 
@@ -256,7 +256,7 @@ def _presses(state: CoreState, now: float) -> bool:
 def _made(
     state: CoreState, job: Job, result: Replanned | Timeline | str, now: float, limits: Limits
 ) -> tuple[CoreState, list[Effect]]:
-    """Take the result of a job: propose it, or tell why there is nothing to propose."""
+    """Handle the result of a job: propose it, or answer why there is nothing to propose."""
     match result:
         case str():
             if job.request is None:
@@ -280,12 +280,12 @@ def _made(
 def _answered(
     state: CoreState, sent: Sent, answer: Answered, now: float, limits: Limits
 ) -> tuple[CoreState, list[Effect]]:
-    """Take the pilot's answer to a proposal."""
+    """Handle the pilot's answer to a proposal."""
     job, made = sent.job, sent.made
     state = state.learned(job.kind, max(answer.came, sent.sent) - job.begun)
     if answer.commitment is None:
         if sent.unanswered and job.request is not None:
-            return state, []  # it was refused already
+            return state, []  # refusal already reported
         if answer.reason.startswith(Fault.LATE):
             return _late(state, job, answer.reason, now)
         if job.request is None:
@@ -294,7 +294,7 @@ def _answered(
         return state, [Tell(refused)]
     due = math.floor((now - state.begun) * RATE)  # the pilot looked a little earlier
     committed = spliced(state.timeline.commitment, made.proposal, min(due, made.proposal.splice - LEAST_AHEAD))
-    if committed.checksum != answer.commitment:  # it got other bytes than were sent; what it flies is not known
+    if committed.checksum != answer.commitment:  # the pilot got other bytes than were sent: its commitment is unknown
         return replace(state, sent=sent), []
     state = replace(state, timeline=made.accepted(committed))
     if sent.behind is not None:
@@ -310,7 +310,7 @@ def _answered(
 
 
 def _late(state: CoreState, job: Job, reason: str, now: float) -> tuple[CoreState, list[Effect]]:
-    """Take a proposal that came too late: it is made again from farther ahead; the next part is due anyway."""
+    """Handle a late proposal: replan a request from farther ahead; the next part of a plan is due again anyway."""
     state = state.learned(job.kind, now - job.begun)
     if job.request is None:
         return state, []
@@ -321,9 +321,9 @@ def _late(state: CoreState, job: Job, reason: str, now: float) -> tuple[CoreStat
 
 
 def _cut_short(state: CoreState, reason: str, limits: Limits) -> tuple[CoreState, list[Effect]]:
-    """Let the vehicle rest behind what is committed, as more does not pass.
+    """End the motion at rest behind the committed part, because the next part failed.
 
-    From there it goes on, unless that is what does not pass.
+    The vehicle goes on from there, unless it was the plan from there that failed.
     """
     timeline = state.timeline.cut_short(limits, going_on=state.timeline.part_ends is not None)
     state = replace(state, timeline=timeline)

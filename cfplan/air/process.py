@@ -1,6 +1,6 @@
-"""The core of planning in the air in real time: a process beside the pilot's.
+"""Drives the core of planning in the air in real time, in a process beside the pilot's.
 
-It may die, hang or be killed; then the vehicle ends on what is committed.
+If that process dies, hangs or is killed, the vehicle flies its commitment to the end.
 """
 
 import contextlib
@@ -29,29 +29,29 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 
-PRIORITY = -10  # niceness of the planner where that is allowed: behind the pilot, before all else
-_GARBAGE = 100_000  # objects, after which it is looked through in any case
-_SWITCH_INTERVAL = 0.0002  # s; a thread with loops gets the interpreter back after at most this
+PRIORITY = -10  # niceness of the planner, if allowed: below the pilot, above all else
+_GARBAGE = 100_000  # allocations after which garbage is collected in any case
+_SWITCH_INTERVAL = 0.0002  # s, after which a thread that waits for the interpreter gets it
 _CLOSE_WITHIN = 1.0  # s
-_FIRST_JOBS = 1.0, 0.1  # s that a plan, and a stop, are taken to need where warming up made none
-_MIDDLE = 0.4, 0.6  # fractions of the space's size, where warming up flies to
+_FIRST_JOBS = 1.0, 0.1  # s to assume for a plan and for a stop if warming up made none
+_MIDDLE = 0.4, 0.6  # fractions of the space's size: the places that plans of the warm-up lead to
 
 
 class AirPlanner:
-    """The planner's process as the main process sees it; a context manager."""
+    """The main process's handle of the planner process; a context manager."""
 
     def __init__(self, timeline: Timeline, limits: Limits, pilot: Connection):
-        """Start it; `timeline` is what the pilot's mission was made from, `pilot` the end of its proposals."""
+        """Start the process; the pilot's mission was made from `timeline`, `pilot` is the pipe for proposals."""
         context = multiprocessing.get_context("spawn")
         self._requests, requests_end = context.Pipe()
         self._process = context.Process(target=_run, args=(timeline, limits, requests_end, pilot), name="planner")
         self._process.start()
         requests_end.close()
         self._number = 0
-        self.ready = False  # whether it has said that it can plan
+        self.ready = False  # whether it has reported that it can plan
 
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
-        """Ask for a change; return the number of its answer. A planner that has ended answers nothing."""
+        """Send a request; return its number, which its answer names. A planner that has ended never answers."""
         self._number += 1
         points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
         with contextlib.suppress(OSError):
@@ -59,7 +59,7 @@ class AirPlanner:
         return self._number
 
     def answers(self, patience: float = 0.0) -> list[PathAnswer]:
-        """Return the answers since the last call; wait for one for `patience`, s."""
+        """Return the answers since the last call; wait up to `patience`, s, for the first."""
         found: list[PathAnswer] = []
         with contextlib.suppress(EOFError, OSError):
             while self._requests.poll(0.0 if found else patience):
@@ -72,16 +72,16 @@ class AirPlanner:
 
     @property
     def process_id(self) -> int | None:
-        """Return the number of the process."""
+        """Return the process id."""
         return self._process.pid
 
     @property
     def alive(self) -> bool:
-        """Return whether it runs."""
+        """Return whether the process runs."""
         return self._process.is_alive()
 
     def close(self) -> None:
-        """End it. May be called twice."""
+        """End the process. May be called twice."""
         self._requests.close()
         self._process.join(_CLOSE_WITHIN)
         if self._process.is_alive():
@@ -98,17 +98,17 @@ class AirPlanner:
 
 
 class PlannerWorker:
-    """The core in its process: it takes events from pipes, and does jobs between them."""
+    """Runs the core in the planner process: reads events from pipes, and does jobs in between."""
 
     def __init__(
         self, timeline: Timeline, limits: Limits, requests: Connection, pilot: Connection, clock: Clock = REAL_CLOCK
     ):
         self._limits, self._requests, self._pilot, self._clock = limits, requests, pilot, clock
         self.state = first_state(timeline, *_FIRST_JOBS)
-        self._idle = True  # garbage was looked for since the last job
+        self._idle = True  # whether garbage was collected since the last job
 
     def warm_up(self) -> None:
-        """Do jobs and discard what they make, so that all code is loaded, and it is known how long they take."""
+        """Do jobs and discard their results, to load all code and to learn how long jobs take."""
         timeline, limits = self.state.timeline, self._limits
         end = timeline.ahead[-1]
         space = limits.space
@@ -127,7 +127,7 @@ class PlannerWorker:
                 self.state = first_state(timeline, planned - begun, self._clock.now() - planned)
 
     def serve(self) -> None:
-        """Plan until the main process or the pilot has ended."""
+        """Handle events until the main process or the pilot has ended."""
         while True:
             if self.state.job is None and not self._idle and self.state.wakes is None:
                 gc.collect()
@@ -139,14 +139,14 @@ class PlannerWorker:
             self._take(events)
 
     def _heard(self) -> Event:
-        """Return what the pilot has sent."""
+        """Read an event from the pilot."""
         answer = read_answer(self._pilot.recv_bytes())
         if answer.begun is not None:
             return Begun(answer.begun)
         return Answered(answer.proposal, answer.commitment, answer.came, answer.reason)
 
     def _take(self, events: list[Event]) -> None:
-        """Take events, and do what follows from them; jobs are done here, while pipes keep what comes."""
+        """Step the core and carry out its effects; jobs run here, while the pipes buffer further events."""
         while True:
             self.state, effects = step(self.state, events, self._clock.now(), self._limits)
             events = []
@@ -180,10 +180,10 @@ def _run(timeline: Timeline, limits: Limits, requests: Connection, pilot: Connec
 
 
 def _hasten() -> None:
-    """Let this process be held up by as little as may be: what it has already is no garbage, and others have time."""
+    """Reduce pauses in this process: exempt present objects from garbage collection, and raise its priority."""
     gc.collect()
-    gc.freeze()  # what was imported is not looked through again in flight
-    gc.set_threshold(_GARBAGE)  # the worker looks when nothing is asked for
-    with contextlib.suppress(OSError, AttributeError):  # not everybody may; other systems have other ways
+    gc.freeze()  # collections in flight skip all that was imported
+    gc.set_threshold(_GARBAGE)  # the worker collects when it is idle
+    with contextlib.suppress(OSError, AttributeError):  # needs permission, and Linux
         for thread in map(int, os.listdir("/proc/self/task")):
             os.setpriority(os.PRIO_PROCESS, thread, PRIORITY)

@@ -1,7 +1,7 @@
-"""Replanning: from a timeline and a request to a certified proposal for the pilot.
+"""Replan from the current timeline: turn a request into a certified proposal for the pilot.
 
-The motion changes as soon as the proposal can be in time. Where no path leads on from there, or where link loss or a
-gap would end badly, later joints and lower speeds are tried; and at last a plan from rest, behind a stop.
+The motion changes at the first joint for which the proposal can be in time. If no path leads on from there, or if link
+loss or a gap would end badly, later joints and lower speeds are tried, and finally a plan from rest behind a stop.
 """
 
 import itertools
@@ -23,14 +23,14 @@ from cfplan.geometry.min_snap import MIN_SPACING, spaced
 from cfplan.planning.continuation import Continuation, NoWayError, check_waypoints, continue_plan, plan_from_rest
 from cfplan.safety.limits import Limits
 
-SLOWER = (1.2, 0.7)  # m/s, at which a flight is tried that would end badly at full speed
-JOINT_DELAYS = (0, 5, 15, 35)  # setpoints by which the vehicle flies on before it turns off, one after another
-SOON = 3  # setpoints by which the vehicle slows down later than the next part needs, which was planned in vain by then
-PACE = 0.75  # by which a request lowers the speed; one to raise it undoes that
+SLOWER = (1.2, 0.7)  # m/s, tried in order if the flight would end badly at full speed
+JOINT_DELAYS = (0, 5, 15, 35)  # setpoints by which the joint is delayed, tried in order
+SOON = 3  # setpoints by which a plan that slows down begins later than the splice: planning the next part took time
+PACE = 0.75  # factor by which a request lowers the speed; a request to fly faster undoes it
 
 
 class PlanOptions(TypedDict):
-    """What continue_plan() takes by name."""
+    """Keyword arguments of continue_plan()."""
 
     yaw_angle: float  # rad
     speed: float  # m/s
@@ -39,27 +39,27 @@ class PlanOptions(TypedDict):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplanSpec:
-    """What a new plan is to do."""
+    """The specification of a new plan."""
 
     points: NDArray  # (K, 3) m, waypoints
-    keep: bool  # whether they follow those ahead; else they replace them
-    yaw_angle: float  # rad, to which the vehicle turns
-    part: int | None = None  # setpoints to commit at once, with the stop behind them; None: all
+    keep: bool  # whether the waypoints follow those ahead; else they replace them
+    yaw_angle: float  # rad, final yaw
+    part: int | None = None  # setpoints to commit at once, before the stop; None: all
     speed: float = math.inf  # m/s, at most
-    leave_room: bool = True  # to limits, as in continue_plan()
+    leave_room: bool = True  # see continue_plan()
 
     @property
     def options(self) -> "PlanOptions":
-        """Return what continue_plan() takes by name."""
+        """Return the keyword arguments of continue_plan()."""
         return {"yaw_angle": self.yaw_angle, "speed": self.speed, "leave_room": self.leave_room}
 
 
 def answer_request(
     timeline: Timeline, request: PathRequest, splice: int, limits: Limits, part: int | None = None
 ) -> Replanned | Timeline:
-    """Return the proposal that does what is asked for from setpoint `splice` on; `part` as in replan().
+    """Return the proposal that meets a request from setpoint `splice` on; `part` as in replan().
 
-    Where nothing need be proposed, the timeline from now on. Raises a CfplanError where no plan does it.
+    Returns the new timeline instead if nothing need be proposed. Raises a CfplanError if no plan meets the request.
     """
     yaw = _final_yaw(timeline)
     match request.wish:
@@ -96,14 +96,14 @@ def replan(
 ) -> Replanned:
     """Return the proposal to leave a timeline at setpoint `splice` and to go through waypoints, (K, 3) m, to rest.
 
-    The motion changes there, or a little later where it cannot do so at once. With `keep`, the waypoints follow those
-    that are ahead, and the motion changes only once that to them has begun; else they replace them. Waypoints closer
-    than MIN_SPACING to the one before, or to where the plan begins, are left out. Where the vehicle rests by then, the
-    plan begins from rest. Where link loss or a gap would end badly, the vehicle flies slower. So many setpoints are
-    proposed as `part` says, and the stop behind them; without it, all.
+    The motion changes there, or a little later if it cannot change at once. With `keep`, the waypoints follow those
+    ahead, and the motion changes only once the last trajectory, which leads to these, has begun; else they replace
+    them. Waypoints closer than MIN_SPACING to the one before, or to where the plan begins, are left out. If the vehicle
+    rests by then, the plan begins from rest. If link loss or a gap would end badly, the vehicle flies slower. The
+    proposal has `part` setpoints and the stop behind them; without `part`, all setpoints.
 
     Raises:
-        InputError: what is given are no waypoints.
+        InputError: the waypoints are not rows of three numbers.
         InfeasibleError: no plan leads through them from there, or link loss would end outside the walls.
         NotCertifiedError: the plan, its bytes, a stop, a gap or the dry run does not pass.
     """
@@ -125,8 +125,8 @@ def replan_behind_stop(
 ) -> Replanned:
     """Return the proposal to go through waypoints, (K, 3) m, from rest, behind the stop from setpoint `splice` on.
 
-    For where no way leads there from the motion. The `stop` is to be proposed first, unless the vehicle stops as soon
-    anyway. Raises as replan() and halt() do; then nothing is to be proposed.
+    For waypoints to which no path leads from the present motion. The `stop` of the result must be proposed first; it is
+    None if the vehicle stops as soon anyway. Raises as replan() and halt() do; then nothing is to be proposed.
     """
     stop = halt(timeline, splice, limits)
     resting = stop if isinstance(stop, Timeline) else stop.accepted(spliced(timeline.commitment, stop.proposal, splice))
@@ -140,14 +140,14 @@ def replan_behind_stop(
 def next_part(timeline: Timeline, splice: int, limits: Limits, part: int) -> Replanned | Timeline:
     """Return the proposal of the next `part`, setpoints, of a plan that is committed in parts, from `splice` on.
 
-    Where that would end badly, the vehicle flies slower, from soon on if that helps, else from the part on. Where it
-    stops by then, as this comes too late, it goes on from rest. Where all was flown, the timeline, and nothing need be
-    proposed. Raises as replan() does; then the vehicle rests behind the part before.
+    If it would end badly, the vehicle flies slower: from shortly behind `splice` on, or else from the new part on. If
+    it will have stopped, because this call comes too late, it goes on from rest. Returns the timeline if all is
+    committed and nothing need be proposed. Raises as replan() does; then the vehicle rests behind the part before.
     """
     timeline = timeline.for_plans_from(splice, limits)
     rest_of_it = ReplanSpec(np.empty((0, 3)), True, _final_yaw(timeline), part)
     if timeline.part_ends is not None:
-        ahead = timeline.part_ends - 1  # what is before that is committed already
+        ahead = timeline.part_ends - 1  # all before it is committed already
         with suppress(EndsBadlyError, NotCertifiedError):
             made = certify_beginning(timeline.onward(ahead, timeline.motion), part, limits, foresee=False)
             proposal = propose(timeline.commitment, ahead, made.payloads, made.stops, made.ending, goes_on=True)
@@ -161,9 +161,9 @@ def next_part(timeline: Timeline, splice: int, limits: Limits, part: int) -> Rep
 def bound_already(
     timeline: Timeline, splice: int, waypoints: ArrayLike, limits: Limits, *, keep: bool = False
 ) -> Timeline | None:
-    """Return the timeline if by it the vehicle already flies this request to replan(), or rests there; else None."""
+    """Return the timeline if the vehicle already flies through these waypoints, or rests there; else None."""
     points = np.asarray(waypoints, dtype=float).reshape(-1, 3)
-    if not len(points):  # nothing was asked for
+    if not len(points):  # no waypoints were requested
         return None
     resting = timeline.for_plans_from(splice, limits)
     splice, _ = resting.leaving(splice, keep=keep)
@@ -200,7 +200,7 @@ def _search(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits, *
                 if joint_of(splice + delay) > timeline.ends:
                     break
         else:
-            break  # nor does a path lead on more slowly
+            break  # no path exists at this speed, so none will at a lower one
     if refused is None:
         raise InfeasibleError("it flies as slowly as may be", where="request", hint="nothing need be flown")
     raise refused
@@ -224,7 +224,7 @@ def _replan_at(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits
 def _planned(
     timeline: Timeline, joint: float, left: int, spec: ReplanSpec, limits: Limits
 ) -> tuple[NDArray, Continuation]:
-    """Return the waypoints of a plan, (K, 3) m, and the plan that leaves a trajectory of the timeline at a joint, s."""
+    """Return the waypoints, (K, 3) m, and a plan through them that leaves trajectory `left` at a joint, s."""
     leave, trajectory = joint - timeline.motion.starts[left], timeline.motion.trajectories[left]
     if leave >= trajectory.duration:
         place = timeline.motion.at(joint)

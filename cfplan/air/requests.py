@@ -9,13 +9,13 @@ from cfplan.planning.plan_result import Plan
 
 
 class Wish(StrEnum):
-    """What a request is for."""
+    """The kind of a request."""
 
     EXTEND = "extend"  # fly on through these waypoints after those ahead
     REPLACE = "replace"  # fly through these instead
     STOP = "stop"  # come to rest soon, ahead on the path
-    SLOWER = "slower"  # fly what is ahead, and what is asked for later, at three quarters of the speed
-    FASTER = "faster"  # undo that
+    SLOWER = "slower"  # fly the rest, and later requests, at three quarters of the speed
+    FASTER = "faster"  # undo SLOWER
 
 
 class PathVerdict(StrEnum):
@@ -33,14 +33,14 @@ class PathVerdict(StrEnum):
 class PathRequest:
     """A request to change the path in flight."""
 
-    number: int  # by which its answer names it
+    number: int  # its answer has the same number
     wish: Wish
     waypoints: tuple[Triple, ...] = ()  # m
 
 
 @dataclass(frozen=True, slots=True)
 class AnswerTimes:
-    """Times of the steps by which a request was accepted, s on the clock of time.monotonic()."""
+    """Times of the steps until a request was accepted, s on the clock of time.monotonic()."""
 
     received: float  # the request
     begun: float  # planning; of a request whose first proposal came late, of the second
@@ -56,8 +56,8 @@ class PathAnswer:
     number: int
     verdict: PathVerdict
     reason: str = ""  # one line: why it was refused, or why nothing need be proposed
-    joint: float = math.nan  # s from the first setpoint, from when on the new plan is flown
-    ends: float = math.nan  # s from the first setpoint, when it ends
+    joint: float = math.nan  # s from the first setpoint, when the new plan takes over
+    ends: float = math.nan  # s from the first setpoint, when the motion ends
     seconds: float = 0.0  # s from the request to the answer
     splice: int = -1  # number of the first setpoint of the proposal that was accepted; -1 where nothing was proposed
     checksum: int = 0  # of that proposal

@@ -1,6 +1,6 @@
-"""The core of planning in the air on a stepped clock, in the pilot's own thread: jobs take the time that they are told.
+"""Drives the core of planning in the air on a stepped clock, in the pilot's thread; jobs take a given time.
 
-Only processes, pipes and the computer's own time are left out. It can be made to fail as a process can.
+Only processes, pipes and the computer's own time are left out. Faults of a real planner process can be injected.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,22 +18,22 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 
-PLANNING = 0.1  # s that planning takes
-STOPPED = 1.0  # s for which a planner that is stopped stands still
+PLANNING = 0.1  # s that a job takes
+STOPPED = 1.0  # s for which a stopped planner stands still
 
 
 class PlannerFault(Enum):
-    """What can be wrong with a planner."""
+    """Faults of a planner."""
 
-    KILLED = "killed"  # it plans and answers nothing any more
+    KILLED = "killed"  # it no longer plans or answers
     STOPPED = "stopped"  # each proposal comes STOPPED s later than it should
-    LATE = "late"  # each proposal comes a setpoint later than it may
+    LATE = "late"  # each proposal arrives one setpoint too late
     GARBAGE = "garbage"  # proposals hold other bytes than were certified
     OTHER_JOINT = "other joint"  # proposals begin three setpoints away from where they were made for
 
 
 class SteppedPlanner:
-    """Makes proposals of requests for a pilot on the same clock; a ProposalSource."""
+    """Turns requests into proposals for a pilot on the same clock; a ProposalSource."""
 
     def __init__(
         self,
@@ -44,14 +44,14 @@ class SteppedPlanner:
         *,
         planning: float = PLANNING,
     ):
-        """Begin with what the pilot's mission was made from; `planning`, s, is what a job takes."""
+        """Begin with the timeline of the pilot's mission; a job takes `planning`, s."""
         self._limits, self._clock, self._on_answer, self._planning = limits, clock, on_answer, planning
         self.state: CoreState = first_state(timeline, planning, planning)
         self.fault: PlannerFault | None = None
-        self.on_committed: Callable[[Replanned], None] = lambda _: None  # hears what the pilot is committed to
+        self.on_committed: Callable[[Replanned], None] = lambda _: None  # called after each acceptance
         self._number = 0
-        self._made: tuple[float, Made] | None = None  # what is being made, and when it is done, s
-        self._coming: tuple[float, Proposal] | None = None  # a proposal on its way to the pilot, and when it arrives, s
+        self._made: tuple[float, Made] | None = None  # when the job under way ends, s, and its result
+        self._coming: tuple[float, Proposal] | None = None  # when a proposal arrives at the pilot, s, and it
 
     @property
     def timeline(self) -> Timeline:
@@ -59,7 +59,7 @@ class SteppedPlanner:
         return self.state.timeline
 
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
-        """Ask for a change; return the number of its answer. The latest request wins."""
+        """Make a request; return its number, which its answer names. The latest request wins."""
         self._number += 1
         request = PathRequest(self._number, wish, tuple(waypoints))
         if self.fault is PlannerFault.KILLED:  # it reads nothing, and answers nothing
@@ -70,14 +70,14 @@ class SteppedPlanner:
 
     @property
     def pending(self) -> frozenset[int]:
-        """Return the numbers of the requests without an answer so far."""
+        """Return the numbers of the requests that are not answered yet."""
         state = self.state
         at_pilot = None if state.sent is None else state.sent.job.request
         in_hand = None if state.job is None else state.job.request
         waiting = None if state.waiting is None else state.waiting[0]
         return frozenset(each.number for each in (at_pilot, in_hand, waiting) if each is not None)
 
-    # What the pilot calls.
+    # Called by the pilot.
 
     def begin(self, start: float) -> None:
         self._take(Begun(start))
@@ -105,12 +105,12 @@ class SteppedPlanner:
     def answer(self, proposal: Proposal, answer: Commitment | Refusal) -> None:
         sent = self.state.sent
         accepted = answer.checksum if isinstance(answer, Commitment) else None
-        checksum = proposal.checksum if sent is None else sent.made.proposal.checksum  # a spoilt one has another
+        checksum = proposal.checksum if sent is None else sent.made.proposal.checksum  # a corrupted one has another
         self._take(Answered(checksum, accepted, self._clock.now(), "" if accepted is not None else str(answer)))
         if sent is not None and isinstance(answer, Commitment):
             self.on_committed(replace(sent.made, timeline=sent.made.accepted(answer)))
 
-    # Within.
+    # Internal.
 
     @property
     def _next_due(self) -> float | None:

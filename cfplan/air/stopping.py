@@ -1,7 +1,7 @@
-"""Stops that are asked for: the vehicle comes to rest on its path, as soon as may be.
+"""Stops on request: the vehicle comes to rest on its path as soon as possible.
 
-There is a stop from each setpoint anyway; one that is asked for is the shortest that keeps what stops may reach and
-that the vehicle can follow.
+Each setpoint has a stop anyway; a stop on request is the shortest one that keeps the limits of stops and that the
+vehicle can follow.
 """
 
 import math
@@ -23,23 +23,23 @@ from cfplan.simulation.dry_run import Rehearsal, rehearse_setpoints
 from cfplan.simulation.link_loss import as_believed, as_most_sluggish, link_loss_at_walls
 
 STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0, DURATION)
-"""s within which a request to stop is tried to be met. From 2 m/s straight on 0.54 s brake at 6.9 m/s², a tilt of 35°;
-where the vehicle turns or slows down already it is more or less. One that holds its deceleration is planned to rest
-0.1 m sooner, but motors that lag let the vehicle overshoot that by as much."""
-STRAYS = 0.025  # m, that a stop shorter than others may add to how far the vehicle strays in its dry run
-"""Where it adds as much, motors are at their ends, and a little noise makes it more: of two stops that strayed by 2.8
-and 4.0 cm in the dry run, the flights strayed by 8.9 and 6.1 cm."""
+"""s, durations of stops, tried in order. From 2 m/s on a straight line a stop of 0.54 s brakes at 6.9 m/s², a tilt of
+35°; the deceleration differs if the vehicle turns or slows down already. A stop of constant deceleration would be
+planned to end 0.1 m sooner, but because motors lag the vehicle would overshoot it by as much."""
+STRAYS = 0.025  # m, by which a shortened stop may increase the deviation in its dry run
+"""Above that, motors saturate, and a little noise increases the deviation: two stops that deviated by 2.8 and 4.0 cm in
+the dry run deviated by 8.9 and 6.1 cm in flight."""
 STRAYS_SLUGGISH = 0.16  # m, likewise with the longest motor lag
-"""That shows it more clearly. Of 440 stops the two that strayed farthest in flight, by 8.3 and 4.6 cm, did so by 0.24
-and 0.22 m in this dry run; the 437 that did so by less than 0.16 m strayed by 4.0 cm at most in flight."""
+"""This lag shows saturation more clearly. Of 440 stops the two that deviated most in flight, by 8.3 and 4.6 cm, did so
+by 0.24 and 0.22 m in this dry run; the 437 that deviated by less than 0.16 m in it, by 4.0 cm at most in flight."""
 
 
 def halt(timeline: Timeline, splice: int, limits: Limits) -> Replanned | Timeline:
-    """Return the proposal to leave a timeline at setpoint `splice` and to come to rest as soon as may be on its path.
+    """Return the proposal to leave a timeline at setpoint `splice` and to rest as soon as possible on its path.
 
-    Where it stops as soon behind the part of a plan that is committed, the timeline on which nothing follows that.
-    Raises InfeasibleError where it rests as soon anyway, or no stop passes: then it rests at the end of what is
-    committed.
+    If the stop behind the committed part of a plan ends as soon, returns the timeline without the rest of that plan.
+    Raises InfeasibleError if the vehicle rests as soon anyway, or if no stop passes: then it rests at the end of its
+    commitment.
     """
     timeline = timeline.for_plans_from(splice, limits)
     splice, _ = timeline.leaving(splice, keep=False)
@@ -62,15 +62,15 @@ def halt(timeline: Timeline, splice: int, limits: Limits) -> Replanned | Timelin
 def stop_within(timeline: Timeline, splice: int, duration: float, limits: Limits) -> Replanned:
     """Return the proposal to stop along the path from the setpoint behind `splice` on, within `duration`, s.
 
-    Raises NotCertifiedError where the stop exceeds what stops may reach or its dry run does not pass, InfeasibleError
-    where link loss or a gap within it would end badly.
+    Raises NotCertifiedError if the stop exceeds the limits of stops or its dry run fails, InfeasibleError if link loss
+    or a gap within it would end badly.
     """
     onward = timeline.onward(splice, timeline.motion)
     return _stop_along(onward.encoded(limits), onward, timeline, splice, duration, limits)
 
 
 def _rests_next(timeline: Timeline, splice: int) -> float:
-    """Return when a vehicle that goes on at setpoint `splice` rests next, s from setpoint 0."""
+    """Return when a vehicle that flies on at setpoint `splice` comes to rest, s from setpoint 0."""
     ahead = [(end - LOOKS_BACK) / RATE for begin, end in timeline.stops if begin > splice]
     return min([timeline.ends if timeline.part_ends is None else (timeline.part_ends + STOP) / RATE, *ahead])
 
@@ -78,7 +78,7 @@ def _rests_next(timeline: Timeline, splice: int) -> float:
 def _stop_along(
     encoded: EncodedFlight, onward: Onward, timeline: Timeline, splice: int, duration: float, limits: Limits
 ) -> Replanned:
-    """Return what stop_within() does; `encoded` are the setpoints of `onward`, from the splice on."""
+    """Return the same as stop_within(); `encoded` are the setpoints of `onward`, from the splice on."""
     motion, gains, space = encoded.motion, encoded.gains, encoded.space
     first, second = np.array([0]), np.array([1])
     stop = encode_stops(motion, RATE, duration, second, gains, space)
@@ -86,7 +86,7 @@ def _stop_along(
     rows, rest = stop[0], stop[0, -1:]
     hovering = np.repeat(rest, round(HOLD * RATE), axis=0)
     payloads = np.concatenate([encoded.payloads[:1], rows, hovering])
-    # From within a stop, what is left of it is the stop; it is as long as all others, the end of it a hover.
+    # From within a stop, the remainder is the stop; a hover pads it to the length of the others.
     whole = encode_stops(motion, RATE, DURATION, first, gains, space)
     padded = np.concatenate([rows, np.repeat(rest, whole.shape[1], axis=0)])
     after = [padded[min(row, len(rows)) :][: whole.shape[1]] for row in range(len(payloads) - 1)]
@@ -104,12 +104,12 @@ def _stop_along(
 
 
 def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: NDArray, begin: NDArray) -> None:
-    """Raise NotCertifiedError where the dry run of a stop fails, or strays as far as only a shorter stop does.
+    """Raise NotCertifiedError if the dry run of a stop fails, or if a shortened stop deviates too far in it.
 
-    `begin`, (3,) m, is where the vehicle is wanted when the payloads begin: how far it is from there is no fault of the
-    stop. What motors can do is certified of the motion, which they follow late. Where a short stop leans from one side
-    to the other at little thrust, controlling the attitude takes what is left of a motor; then the firmware lowers the
-    thrust of all, and the vehicle sinks: by 0.2 m where it came over the top of a climb.
+    `begin`, (3,) m, is the desired place when the payloads begin: an initial distance from it is no fault of the stop.
+    The certificate holds the motors' range along the planned motion, but motors lag. If a short stop swings from one
+    side to the other at low thrust, attitude control saturates a motor; then the firmware lowers the thrust of all, and
+    the vehicle sinks: by 0.2 m at the top of a climb.
     """
     believed = as_believed(starts, limits)
     run = rehearse_setpoints(payloads, limits.airframe, limits.flight, snapshot=believed)
@@ -123,7 +123,7 @@ def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: N
 
 
 def _require_near(run: Rehearsal, most: float, duration: float) -> None:
-    """Raise NotCertifiedError where a stop within a duration, s, strays by more than `most`, m, in its dry run."""
+    """Raise NotCertifiedError if a stop of `duration`, s, deviates by more than `most`, m, in its dry run."""
     if not run.deviation <= most:
         raise NotCertifiedError(
             f"within {duration:g} s the vehicle strays {run.deviation:.3f} m from the stop, more than {most:.3f} m",

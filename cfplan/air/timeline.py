@@ -1,9 +1,9 @@
 """The timeline of a flight: what the pilot is committed to, and what is intended beyond that.
 
-Committed are bytes, which end at rest. Intended is a motion, whose beginning those bytes are; of a long plan only a
-part is committed at once, with the stop behind it, so that the motion changes soon. Where no more of it is committed in
-time, the vehicle rests behind that stop. The simulated vehicle at each setpoint is kept too, so what follows is
-certified as if the flight had been planned so from its beginning.
+The commitment is bytes, which end at rest. The intention is a motion, which begins with those bytes. A long plan is
+committed in parts, each with a stop behind it, so that the motion can change soon; if the next part is not committed in
+time, the vehicle rests at the end of that stop. The timeline also keeps the simulated vehicle at each setpoint, so
+later plans are certified as if the whole flight had been planned before take-off.
 """
 
 import math
@@ -25,10 +25,10 @@ from cfplan.safety.space import inside
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.joint import JoinedTrajectory
 
-LOOKS_BACK = math.ceil(RATE_LEAD * RATE)  # setpoints before one, of whose motion it is made too
-HOVER = 0.02  # s, of the motion that a hover counts as: over before a plan may leave it, LOOKS_BACK setpoints later
+LOOKS_BACK = math.ceil(RATE_LEAD * RATE)  # setpoints before one, whose motion also enters it
+HOVER = 0.02  # s, nominal duration of a hover: over before a plan may leave it, LOOKS_BACK setpoints later
 LEAST_SPEED = 0.2  # m/s, to which requests may lower the speed
-_SNAPSHOTS_KEPT = 6000  # setpoints before a splice, of which snapshots are kept: no plan leaves before these
+_SNAPSHOTS_KEPT = 6000  # setpoints before a splice whose snapshots are kept: no later plan leaves before them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,20 +38,20 @@ class Timeline:
     commitment: Commitment
     motion: JoinedTrajectory  # committed and intended
     ahead: NDArray  # (K, 3) m, waypoints of the last trajectory, in order
-    reached: tuple[float, ...]  # s on its path, of each of them
+    reached: tuple[float, ...]  # s on its path, of each waypoint
     begin: int  # number of the setpoint of the first snapshot
     snapshots: NDArray  # (L, N, 31), the simulated vehicle at each setpoint, for each motor lag
-    speed: float = math.inf  # m/s, a limit for new plans besides
-    part_ends: int | None = None  # number of the first setpoint of the stop behind the part committed; None: all is
-    rest: tuple[Triple, float] | None = None  # m, rad: place and yaw where that stop rests
+    speed: float = math.inf  # m/s, an additional limit for new plans
+    part_ends: int | None = None  # first setpoint of the stop behind the committed part; None: all is committed
+    rest: tuple[Triple, float] | None = None  # m, rad: place and yaw at which that stop ends
     left: NDArray = field(default_factory=lambda: np.empty((0, 3)))  # (J, 3) m, waypoints to go on to from rest
     stops: tuple[tuple[int, int], ...] = ()
-    """First setpoint and end of each stop on the way. Between them the motion is not that behind the bytes, but that
-    along which they brake, so no plan leaves it there."""
+    """First setpoint and end of each stop on the way. Within a stop the bytes brake along `motion` and do not follow it
+    in time, so no plan leaves it there."""
 
     @property
     def ends(self) -> float:
-        """Return when the motion ends, s, once all of it is committed."""
+        """Return the end of the motion, s, if all of it is committed."""
         return self.motion.duration
 
     @property
@@ -61,23 +61,22 @@ class Timeline:
 
     @property
     def stopping(self) -> bool:
-        """Return whether the last motion is a stop that was asked for, or was left by."""
+        """Return whether the last motion is the hover behind a stop."""
         return bool(self.stops) and _setpoint(self.motion.starts[-1]) + LOOKS_BACK == self.stops[-1][1]
 
     def snapshots_at(self, splice: int) -> NDArray:
-        """Return (L, 31), the simulated vehicle at a setpoint; behind the last it hovers."""
+        """Return (L, 31), the simulated vehicle at a setpoint; after the last one it hovers."""
         return np.asarray(self.snapshots[:, min(max(splice - self.begin, 0), self.snapshots.shape[1] - 1)])
 
     def onward(self, splice: int, motion: JoinedTrajectory) -> Onward:
-        """Return a motion on this clock as one that goes on from a setpoint."""
+        """Return a motion on this clock as one that continues from a setpoint."""
         row = min(splice, self.commitment.last) - self.commitment.first
         return Onward(motion.since(splice / RATE), self.snapshots_at(splice), self.commitment.payloads[row])
 
     def leaving(self, splice: int, *, keep: bool) -> tuple[int, int]:
-        """Return from which setpoint on another plan can be flown, not before `splice`, and the trajectory that it
-        leaves.
+        """Return the first setpoint, `splice` or later, at which a plan can begin, and the trajectory that it leaves.
 
-        With `keep` that is the last one, as the waypoints on it stay. No plan leaves within a stop.
+        With `keep` that is the last trajectory, whose waypoints stay. No plan begins within a stop.
         """
         if keep:
             splice = max(splice, _setpoint(self.motion.starts[-1]))
@@ -88,7 +87,7 @@ class Timeline:
         return splice, max(last, 0)
 
     def still_ahead(self, leave: float) -> list[int]:
-        """Return which of the waypoints ahead are not yet passed at `leave`, s on the clock of the last trajectory."""
+        """Return the indices of the waypoints not yet passed at `leave`, s on the clock of the last trajectory."""
         last = self.motion.trajectories[-1]
         s = float(last.s_at(max(leave, 0.0)))
         here = last.path(s)
@@ -99,11 +98,11 @@ class Timeline:
         ]
 
     def slowed_to(self, speed: float) -> "Timeline":
-        """Return the same, whose new plans fly at a speed, m/s, at most."""
+        """Return the timeline with another speed limit, m/s, for new plans."""
         return replace(self, speed=max(speed, LEAST_SPEED))
 
     def resting(self, rest: tuple[Triple, float], stop: tuple[int, int], limits: Limits) -> "Timeline":
-        """Return the timeline that stops from a setpoint on, and from another on rests at a place, m, and yaw, rad."""
+        """Return the timeline with a stop, between two setpoints, and then rest at a place, m, and yaw, rad."""
         place, yaw = rest
         motion = self.motion.continued(joint_of(stop[1]), hover_at(place, yaw, HOVER, limits.airframe))
         return replace(
@@ -112,9 +111,10 @@ class Timeline:
         )  # fmt: skip
 
     def cut_short(self, limits: Limits, *, going_on: bool) -> "Timeline":
-        """Return the timeline on which no more is committed than now; with `going_on` its waypoints are left.
+        """Return the timeline that ends with the present commitment.
 
-        To those the vehicle goes on from rest. A plan that is committed whole stays as it is.
+        With `going_on` the waypoints not reached are kept in `left`, to go on to from rest. A plan of which all is
+        committed stays as it is.
         """
         if self.part_ends is None:
             return self if going_on else replace(self, left=np.empty((0, 3)))
@@ -124,16 +124,16 @@ class Timeline:
         return replace(self.resting(self.rest, (self.part_ends, self.part_ends + STOP), limits), left=left)
 
     def for_plans_from(self, splice: int, limits: Limits) -> "Timeline":
-        """Return the timeline for a plan from a setpoint on: where the part committed ends before, it is cut short."""
+        """Return the timeline for a plan from a setpoint on: cut short if the committed part ends before that."""
         if self.part_ends is None or splice < self.part_ends:
             return self
         return self.cut_short(limits, going_on=True)
 
     def with_certified(self, splice: int, made: CertifiedFlight) -> "Timeline":
-        """Return the timeline once what was certified from a setpoint on is committed; its commitment is still this."""
+        """Return the timeline with a certified flight from a setpoint on; its commitment is still the present one."""
         first = min(max(splice - _SNAPSHOTS_KEPT, self.begin, self.commitment.first), splice)
         rows = np.arange(first, splice) - self.begin
-        before = self.snapshots[:, np.minimum(rows, self.snapshots.shape[1] - 1)]  # behind the last the vehicle waits
+        before = self.snapshots[:, np.minimum(rows, self.snapshots.shape[1] - 1)]  # hovers after the last
         return replace(
             self,
             begin=first,
@@ -152,22 +152,22 @@ class Replanned:
 
     proposal: Proposal
     timeline: Timeline
-    plan: Plan | None  # None for a stop, and for more of a plan
-    joint: float  # s from setpoint 0, from when on the motion is another
-    stop: "Replanned | None" = None  # to be proposed before it, where it begins from the rest behind that
+    plan: Plan | None  # None for a stop, and for a later part of a plan
+    joint: float  # s from setpoint 0, when the new motion takes over
+    stop: "Replanned | None" = None  # to be proposed first, if the plan begins at rest behind it
 
     def accepted(self, commitment: Commitment) -> Timeline:
-        """Return the timeline once the pilot is committed to it."""
+        """Return the timeline with the pilot's new commitment."""
         return replace(self.timeline, commitment=commitment)
 
     def behind(self, commitment: Commitment) -> "Replanned":
-        """Return what was made behind a stop, to be proposed now that the pilot is committed to that."""
+        """Return the proposal behind a stop, ready to send once the pilot is committed to that stop."""
         proposal = replace(self.proposal, follows=commitment.checksum)
         return replace(self, proposal=proposal, timeline=self.accepted(commitment), stop=None)
 
 
 def joint_of(splice: int) -> float:
-    """Return when a plan from a setpoint on changes the motion, s: that setpoint is still the committed one."""
+    """Return the joint, s, of a plan that begins at a setpoint, which itself stays as committed."""
     return splice / RATE + LEAD
 
 
@@ -179,8 +179,8 @@ def _setpoint(joint: float) -> int:
 def hold(planned: Plan, waypoints: ArrayLike) -> Timeline:
     """Return the timeline of a plan that begins at rest, through waypoints (K, 3) m with centripetal times.
 
-    The first waypoint is its start. Raises InfeasibleError or NotCertifiedError where it does not pass what replan()
-    asks of plans.
+    The first waypoint is its start. Raises InfeasibleError or NotCertifiedError if it fails the checks that replan()
+    makes of plans.
     """
     points = np.asarray(waypoints, dtype=float)
     motion = JoinedTrajectory((planned.trajectory,), (0.0,))
@@ -190,9 +190,9 @@ def hold(planned: Plan, waypoints: ArrayLike) -> Timeline:
 
 
 def hold_hover(position: Triple, yaw: float, limits: Limits) -> Timeline:
-    """Return the timeline of a vehicle that hovers at a position, m, with a yaw, rad, until it is asked to fly.
+    """Return the timeline of a vehicle that hovers at a position, m, with a yaw, rad, until a request comes.
 
-    Raises InfeasibleError where that lies outside the space, or link loss there would end outside the walls.
+    Raises InfeasibleError if that lies outside the space, or if link loss there would end outside the walls.
     """
     (beyond,), (face,) = limits.space.nearest(np.array([position]))
     if not inside(beyond):

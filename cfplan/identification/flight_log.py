@@ -1,4 +1,4 @@
-"""The log of one flight as validation reads it: state estimate, commands, sensors and poses on the vehicle's clock."""
+"""Flight logs for validation: state estimate, commands, sensors and poses on the vehicle's clock."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,20 +18,20 @@ from cfplan.vehicle.airframe import GRAVITY
 STATE = 13  # columns of the state
 FEWEST, SHORTEST = 200, 2.0  # records; s
 LONGEST_GAP = 0.5  # s without a record, beyond which a controller's integrals cannot be followed
-_GAP, _BESIDE = 0.03, 0.15  # s without a record; s before and behind it in which nothing counts
-_RATE = 90.0  # 1/s, records that a recomputation of the controller needs
+_GAP, _BESIDE = 0.03, 0.15  # s without a record that make a gap; s beside a gap that are left out
+_RATE = 90.0  # 1/s, least rate of records for recomputing the controller
 _FASTEST_TURN = np.radians(80.0)  # rad of tilt beyond which a vehicle has crashed
 _COMMANDS = (("thrustSI", "thrustSi"), ("torquex",), ("torquey",), ("torquez",))  # of ctrlLee, by firmware
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightLog:
-    """What a vehicle logged of a flight; N records, M poses of motion capture."""
+    """The log of a flight: N records, M poses of motion capture."""
 
     name: str
     time: NDArray  # (N,) s, ascending, from 0
     state: NDArray  # (N, 13) estimated position m, velocity m/s, quaternion x y z w; body rate rad/s as measured
-    control: NDArray  # (N, 4) thrust N and torques N m that the controller asked for; NaN where not logged
+    control: NDArray  # (N, 4) commanded thrust, N, and torques, N m; NaN where not logged
     acceleration: NDArray | None = None  # (N, 3) m/s², specific force in body axes
     voltage: NDArray | None = None  # (N,) V
     setpoint: NDArray | None = None  # (N, 6) m, m/s, as logged by the controller
@@ -61,7 +61,7 @@ class FlightLog:
         return Rotation.from_quat(self.state[:, 6:10])
 
     def away_from_gaps(self, time: NDArray) -> NDArray:
-        """Return which times, (K,) s, are not beside a gap of the records, where nothing is known for a moment."""
+        """Return which times, (K,) s, are not beside a gap in the records."""
         away = np.ones(len(time), dtype=bool)
         for k in np.flatnonzero(self.gaps > _GAP):
             away &= (time < self.time[k] - _BESIDE) | (time > self.time[k + 1] + _BESIDE)
@@ -70,7 +70,7 @@ class FlightLog:
     def between(self, begin: float, end: float) -> "FlightLog":
         """Return the part from one time to another, s; its times count from its first record.
 
-        Raises InputError where there is none.
+        Raises InputError if it is empty.
         """
         keep = (self.time >= begin) & (self.time <= end)
         if not keep.any():
@@ -88,7 +88,7 @@ class FlightLog:
 
 
 def check_log(log: FlightLog) -> None:
-    """Raise InputError where a flight cannot be recomputed: too short, with gaps, or crashed; with the time."""
+    """Raise InputError if a flight cannot be recomputed: it is too short, has gaps, or crashed."""
     where = log.name
     if len(log.time) < FEWEST or log.duration < SHORTEST:
         message = f"too short: {len(log.time)} records in {log.duration:.1f} s"
@@ -114,10 +114,10 @@ def check_log(log: FlightLog) -> None:
 
 
 def read_microsd(file: Path) -> FlightLog:
-    """Read a microSD log that has the estimate, and what the Lee controller asked for.
+    """Read a microSD log with the state estimate and the commands of the Lee controller.
 
     Raises:
-        InputError: it is no such log, damaged, or lacks variables; the hint names those to log.
+        InputError: the file is not such a log, is damaged, or lacks variables; the hint names those to log.
     """
     if find_importer(file) is not usd_log:
         raise InputError("no microSD log of a Crazyflie", where=str(file), hint="give a log or a record of cfplan")
@@ -189,7 +189,7 @@ def _rates(table: Mapping[str, NDArray]) -> NDArray | None:
 
 
 def _poses(table: Mapping[str, NDArray], time: NDArray) -> tuple[NDArray, NDArray]:
-    """Return when motion capture's poses changed, and to what."""
+    """Return the times at which motion capture's poses changed, and the new poses."""
     poses = _columns(table, "locSrv", ("x", "y", "z", "qx", "qy", "qz", "qw"))
     if poses is None:
         return np.empty(0), np.empty((0, 7))

@@ -15,8 +15,8 @@ _MELLINGER_GAINS = tuple(each.name for each in fields(MellingerGains))
 def read_gains(file: Path) -> Controller:
     """Return the controller of the gains in a file: Lee's by the names of ctrlLee, Mellinger's by those of `firmware`.
 
-    Gains that it does not name are the firmware's defaults; other keys, as of an experiment's notes, are ignored.
-    Raises InputError where it names none, or a value that is no number.
+    Gains left out have the firmware's defaults; other keys, such as notes of an experiment, are ignored. Raises
+    InputError if the file names no gain, or if a value is not a number.
     """
     values = read_plain(file)
     by_lee = {name: values[name] for name in LEE_GAINS if name in values}

@@ -1,4 +1,4 @@
-"""A flight ready to be validated, of a record by cfplan or of a microSD log: its reference begun as it was flown."""
+"""Prepare a flight for validation, from a record of cfplan or a microSD log, with its reference at the actual start."""
 
 import math
 from dataclasses import dataclass, replace
@@ -21,26 +21,26 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import yaw_of
 
 Triple = tuple[float, float, float]
-LINK_DELAY = 0.005  # s from sending a setpoint to its coming into force
-_LATEST = 0.030  # s by which messages of the estimate may be dated late
+LINK_DELAY = 0.005  # s from sending a setpoint to its effect
+_LATEST = 0.030  # s, largest delay in the times of estimate messages
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoggedFlight:
-    """A flight with everything that predicting it takes."""
+    """A flight with all inputs of its prediction."""
 
     log: FlightLog
     reference: ReferenceMotion
     controller: Controller
-    airframe: Airframe  # that it was planned with, or of its kind
+    airframe: Airframe  # of its plan, or of its kind
     poses: EstimatorInput
 
 
 def flight_of_record(record: Record, begin: float = 0.0, end: float = math.inf) -> LoggedFlight:
     """Return the flight of a record, or the part between two times, s from its first setpoint.
 
-    The commands of single motors are sampled too seldom to show torques, so of these nothing is known. Raises
-    InputError where there is no flight in it, or too little of it.
+    The commands of single motors are sampled too seldom to show torques, so torques are unknown. Raises InputError if
+    the record holds no flight, or too little of one.
     """
     signals = read_signals(record)
     airframe, time = signals.airframe, signals.estimate_time - _late_by(signals)
@@ -78,7 +78,7 @@ def flight_of_log(
     log: FlightLog, controller: Controller, airframe: Airframe, reference: ReferenceMotion | None = None,
     offset: Triple | None = None,
 ) -> LoggedFlight:  # fmt: skip
-    """Return the flight of a log along a reference whose start is not known, or else along the logged setpoints.
+    """Return the flight of a log along a reference of unknown start, or without one along the logged setpoints.
 
     `offset`, m, is the place of the reference's origin; without it that of the log. Raises InputError without either.
     """
@@ -95,7 +95,7 @@ def flight_of_log(
 
 
 def _reference(record: Record, zero: float) -> ReferenceMotion:
-    """Return the motion that was meant, with the setpoints as sent."""
+    """Return the planned motion, with the setpoints as sent."""
     sent, time = record.setpoints, record.setpoints.time - zero
     attitude, acceleration, _ = meant_motion(sent)
     yaw = np.array([yaw_of(each) for each in attitude])
@@ -107,7 +107,7 @@ def _reference(record: Record, zero: float) -> ReferenceMotion:
 
 
 def _late_by(signals: FlightSignals) -> float:
-    """Return the time, s, by which messages of the estimate are dated late: estimated places against the poses."""
+    """Return the delay in the times of estimate messages, s, from estimated positions against poses."""
     shifts = np.arange(0.0, _LATEST, 0.001)
     places, known = signals.position, signals.pose_time
 

@@ -1,7 +1,7 @@
 """Measure a vehicle from one log: thrust scale in hover, moment and inertia by the torque, drag by the accelerometer.
 
-What a log does not have keeps the airframe's value, and is named. All of it is linear least squares on smoothed
-columns; nothing is fitted to the deviation from the reference.
+Quantities that a log does not show keep the airframe's value and are reported. All fits are linear least squares on
+smoothed columns; nothing is fitted to the deviation from the reference.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,31 +16,31 @@ from cfplan.errors import InputError
 from cfplan.identification.flight_log import FlightLog
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
-HOVER = 1.0  # s from the first record in which the thrust scale is measured
-_PERIOD = 0.002  # s, of the grid that columns are smoothed on
+HOVER = 1.0  # s from the first record, for the thrust scale
+_PERIOD = 0.002  # s, period of the grid on which columns are smoothed
 _SMOOTHING = 0.012  # s
 _CLIMB_SMOOTHING = 0.030  # s, before the climb is differentiated
 _LAGS = np.arange(0.025, 0.125, 0.005)  # s, of the motors
-_FASTEST = 0.35  # m/s in body axes that a flight must reach for a moment or a drag to show
+_FASTEST = 0.35  # m/s in body axes, which a flight must reach to show moment and drag
 _LEAST_FIT = 0.85  # fraction of the torque's variance that moment and inertia must explain
-_INERTIAS, _MOMENTS = (0.5e-5, 6e-5), (0.0, 1.5e-3)  # kg m², N m per m/s: what a Crazyflie may have
+_INERTIAS, _MOMENTS = (0.5e-5, 6e-5), (0.0, 1.5e-3)  # kg m², N m per m/s: plausible for a Crazyflie
 _SCALES = (0.5, 2.0)  # of thrust
 _CURVATURES, _LIFTS = (-0.5, 0.5), (0.0, 0.02)  # of thrust; 1/(m/s)²
 _LEAST_THRUST_VARIED = 0.008  # of its mean
 _FEWEST_POSES = 50
-_MOST_OF_SUM = 0.999  # of the moments of inertia about x and y that the one about z may be
-_ROUNDS = 4  # in which the scale and where the thrust curves agree
+_MOST_OF_SUM = 0.999  # largest inertia about z, as a fraction of the sum of those about x and y
+_ROUNDS = 4  # iterations until the scale and the curvature of thrust agree
 _SLOW = 0.5  # s over which the battery's voltage is averaged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
-    """An airframe as one flight shows it."""
+    """An airframe as measured in one flight."""
 
     airframe: Airframe
-    found: dict[str, str]  # quantity: value with its unit, and how well it is known
+    found: dict[str, str]  # quantity: value with unit and uncertainty
     unknown: tuple[str, ...]  # quantities that the log does not show, each with the reason
-    unlike: tuple[str, ...]  # how it differs from the airframe that was named, by more than its spread
+    unlike: tuple[str, ...]  # differences from the named airframe that exceed its spread
     estimate: dict[str, float]  # errors of the estimate against motion capture: rms of m, m/s and rad; empty if unknown
 
 
@@ -51,18 +51,18 @@ class _Smooth:
     keep: NDArray
     velocity: NDArray  # (K, 3) m/s, body axes: x and y by motion capture where logged
     rate: NDArray  # (K, 3) rad/s
-    torque: NDArray  # (K, 3) N m, as asked for, not smoothed
-    thrust: NDArray  # (K,) N, as asked for, not smoothed
+    torque: NDArray  # (K, 3) N m, commanded, not smoothed
+    thrust: NDArray  # (K,) N, commanded, not smoothed
     force: NDArray | None  # (K, 3) m/s²
     seen: bool  # whether the velocity is motion capture's: the estimated one is too high
     along: NDArray  # (K,) m/s², specific force along the thrust axis: of the accelerometer, or of the climb
 
 
 def thrust_scale(log: FlightLog, airframe: Airframe, seconds: float = HOVER) -> float:
-    """Return thrust given in hover per thrust asked for: the impulse of the first seconds against the change of climb.
+    """Return actual over commanded thrust in hover: the impulse of the first seconds against the change of climb rate.
 
-    The airframe's lift with speed and curvature of thrust are taken out. Raises InputError where no vehicle of that
-    mass flies so: the mass or the vehicle is another.
+    The airframe's lift with speed and curvature of thrust are taken out. Raises InputError if the result is not
+    plausible: the mass or the vehicle is not as stated.
     """
     inside = log.time <= seconds
     time, climb = log.time[inside], log.state[inside, 5]
@@ -94,7 +94,7 @@ def scale_by_voltage(log: FlightLog, airframe: Airframe) -> NDArray:
 
 
 def measure(log: FlightLog, airframe: Airframe) -> Measured:
-    """Return the airframe as the log shows it; the mass is taken as known. Raises InputError as `thrust_scale`."""
+    """Return the airframe as measured in a log; the mass is taken as known. Raises InputError like `thrust_scale`."""
     found: dict[str, str] = {}
     unknown: list[str] = []
     columns = _smoothed(log)
@@ -107,7 +107,7 @@ def measure(log: FlightLog, airframe: Airframe) -> Measured:
 
 
 def unlike(found: Airframe, kind: Airframe) -> list[str]:
-    """Return in words what is farther from an airframe than its spread allows: it may be another vehicle's flight."""
+    """Describe values that differ from an airframe by more than its spread: it may be another vehicle's flight."""
     pairs = [
         ("thrust scale", found.thrust_scale, kind.thrust_scale, kind.spread.thrust_scale),
         ("drag over mass", found.drag[0] / found.mass, kind.drag[0] / kind.mass, kind.spread.drag),
@@ -123,7 +123,7 @@ def unlike(found: Airframe, kind: Airframe) -> list[str]:
 
 
 def pooled(flights: Sequence[Measured], airframe: Airframe) -> Airframe:
-    """Return the airframe with the median of what the flights show; what none shows keeps its value."""
+    """Return the airframe with the medians over the flights; quantities that no flight shows keep their value."""
 
     def median(key: str, value: Callable[[Airframe], float]) -> float:
         values = [value(each.airframe) for each in flights if key in each.found]
@@ -176,7 +176,7 @@ def _has_poses(log: FlightLog) -> bool:
 
 
 def _seen_velocity(log: FlightLog, grid: NDArray) -> NDArray:
-    """Return motion capture's velocity in the rotor plane, (K, 2): the estimated one is some percent too high."""
+    """Return motion capture's velocity in the rotor plane, (K, 2): the estimated one is several percent too high."""
     place = np.column_stack([np.interp(grid, log.pose_time, column) for column in log.poses[:, :3].T])
     seen = np.gradient(gaussian_filter1d(place, _CLIMB_SMOOTHING / _PERIOD, axis=0), _PERIOD, axis=0)
     at = np.searchsorted(log.time, grid).clip(0, len(log.time) - 1)
@@ -184,7 +184,7 @@ def _seen_velocity(log: FlightLog, grid: NDArray) -> NDArray:
 
 
 def _lagged(values: NDArray, lag: float) -> NDArray:
-    """Return what motors of a lag, s, make of a command, smoothed as the other columns."""
+    """Return the response of motors with a lag, s, to a command, smoothed like the other columns."""
     decay = np.exp(-_PERIOD / lag)
     followed = lfilter([1.0 - decay], [1.0, -decay], values, axis=0, zi=decay * values[:1])[0]
     return np.asarray(gaussian_filter1d(followed, _SMOOTHING / _PERIOD, axis=0))
@@ -258,7 +258,7 @@ def _by_accelerometer(columns: _Smooth, known: Airframe, found: dict[str, str], 
 
 
 def _by_thrust(columns: _Smooth, known: Airframe, found: dict[str, str], unknown: list[str]) -> Airframe:
-    """Return the airframe with lift with speed and the thrust's curvature: how thrust follows what is asked for."""
+    """Return the airframe with lift with speed and curvature of thrust, from actual against commanded thrust."""
     keep = columns.keep
     thrust = _lagged(columns.thrust, known.motor_time_constant)[keep]
     given = known.mass * columns.along[keep] + known.drag[1] * columns.velocity[keep, 2]

@@ -1,4 +1,4 @@
-"""The motion that a logged flight was to follow: of polynomials, a plan, or the logged setpoints themselves."""
+"""Reference motions of logged flights: from polynomials, from a plan, or from the logged setpoints."""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,15 +14,15 @@ from cfplan.geometry.polynomial_csv import read_polynomial_rows
 from cfplan.simulation.engine.lee import REFERENCE_SIZE
 from cfplan.vehicle.trajectory import Trajectory
 
-SETPOINT_PERIOD = 0.010  # s, at which the vehicle's commander, or the stream, renews the setpoint
+SETPOINT_PERIOD = 0.010  # s, between setpoints of the vehicle's commander, or of the stream
 POSITION, YAW = slice(0, 3), 12  # columns of a reference's rows
 _STEP = 0.005  # s, of the samples
-_SMOOTHING = 0.20  # s, over which logged setpoints, a staircase of 10 ms and 1 mm, are smoothed to differentiate them
+_SMOOTHING = 0.20  # s, smoothing for the derivatives of logged setpoints, a staircase of 10 ms and 1 mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferenceMotion:
-    """A motion sampled densely: before its start and after its end it rests."""
+    """A densely sampled motion, at rest before its start and after its end."""
 
     source: str
     time: NDArray  # (K,) s
@@ -39,7 +39,7 @@ class ReferenceMotion:
         return rows
 
     def moved(self, start: float, offset: NDArray) -> "ReferenceMotion":
-        """Return the reference begun `start` s later, `offset` (3,) m farther."""
+        """Return the reference shifted by `start`, s, in time and `offset`, (3,) m, in place."""
         rows = self.rows.copy()
         rows[:, POSITION] += offset
         return replace(self, time=self.time + start, rows=rows, sent_time=self.sent_time + start)
@@ -88,8 +88,8 @@ def reference_of_trajectory(trajectory: Trajectory, name: str) -> ReferenceMotio
 def reference_of_setpoints(time: NDArray, setpoint: NDArray, yaw: NDArray | None = None) -> ReferenceMotion:
     """Return the motion of logged setpoints: position, velocity, and acceleration where logged, (N, 6 or 9); yaw (N,).
 
-    A vehicle logs them as a staircase, so each stands for the middle of the time that it holds. What is not logged is
-    differentiated from what is.
+    A vehicle logs them as a staircase, so each is assigned to the middle of the time that it holds. Derivatives
+    that are not logged are computed from the others.
     """
     grid = np.arange(time[0], time[-1], _STEP)
     known = np.column_stack([np.interp(grid, time, column) for column in setpoint.T])

@@ -1,7 +1,7 @@
-"""Recompute a controller's commands from a flight's log: they show whether gains, reference and start are those flown.
+"""Recompute a controller's commands from a flight's log, to check that gains, reference and start are those flown.
 
-The logged state and the reference go into the firmware's law at the log's own times. Only the integrals at the first
-record are unknown; they are fitted. What then remains unexplained is a wrong gain, mass, start or trajectory.
+The firmware's control law is evaluated on the logged state and the reference at the log's times. Only the integrals at
+the first record are unknown; they are fitted. Unexplained commands point to a wrong gain, mass, start or trajectory.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD, Modes, step
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 LEAST_EXPLAINED = 0.95  # fraction of the commands' variance
-# Of the weight, N, and of the weight times the arm, N m: what varies less, as in hover, is mostly the log's rounding.
+# Fractions of the weight, N, and of weight times arm, N m: less variation, as in hover, is mostly the log's rounding.
 _LEAST_VARIED = np.array([0.010, 0.015, 0.015, 0.015])
 _SMOOTHING = 0.008  # s, of both: records of state and command are not of the same control step
 _SEARCHED = 0.5  # s, half the range in which the start is searched for finely
@@ -32,7 +32,7 @@ _FACTORS = (0.4, 2.5)  # range of the factors by which a gain may be wrong
 JERK = slice(9, 12)  # columns of a reference's rows
 _ROUNDS, _LEAST_KNOWN = 3, 1e-6
 _INTEGRALS = np.array([0.1, 0.1, 0.1, 0.01, 0.01, 0.01])  # their usual size at the first record
-# Gains that go together: what a user would call them, and the fields.
+# Gains that belong together: their name for users, and the fields.
 _GROUPS: dict[type, dict[str, tuple[str, ...]]] = {
     LeeGains: {
         "KR": ("KR_x", "KR_y"), "Kw": ("Kw_x", "Kw_y"), "KI": ("KI_x", "KI_y"),
@@ -48,18 +48,18 @@ _GROUPS: dict[type, dict[str, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Controller:
-    """A firmware's controller as it flew."""
+    """The firmware's controller and gains of a flight."""
 
     gains: LeeGains | MellingerGains
-    feeds_jerk: bool = True  # False: firmware of the Lee controller that asks for no body rates
+    feeds_jerk: bool = True  # False: firmware whose Lee controller has no desired body rates
 
     @property
     def by_lee(self) -> bool:
-        """Return whether it is Lee's."""
+        """Return whether it is the Lee controller."""
         return isinstance(self.gains, LeeGains)
 
     def setpoints(self, reference: ReferenceMotion, time: NDArray) -> NDArray:
-        """Return what it is given at these times, (N, 14) of Lee's or (N, 20) of Mellinger's."""
+        """Return the controller's setpoints at these times, (N, 14) for Lee's or (N, 20) for Mellinger's."""
         if not self.by_lee and len(reference.sent):
             return reference.sent_at(time)
         rows = reference.at(time)
@@ -75,12 +75,12 @@ class Controller:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recomputed:
-    """What the controller must have asked for."""
+    """Recomputed commands of the controller."""
 
     control: NDArray  # (N, 4) thrust N, torque x y z N m
     memory: NDArray  # of the controller at the first record, as fitted
-    thrust: float  # fraction of the logged variance that it explains; NaN where not logged
-    torque: float  # the same of roll and pitch together
+    thrust: float  # explained fraction of the logged variance; NaN if not logged
+    torque: float  # likewise, roll and pitch together
 
     @property
     def explained(self) -> float:
@@ -89,7 +89,7 @@ class Recomputed:
 
 
 def recompute(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Recomputed:
-    """Return the commands that a controller gives for the logged state. Raises InputError where none were logged."""
+    """Return the commands that a controller gives for the logged state. Raises InputError if none were logged."""
     gains, setpoints = controller.gains.pack(), controller.setpoints(reference, log.time)
     size = lee.MEMORY_SIZE if controller.by_lee else layout.MEMORY_SIZE
     levers = np.array([airframe.arm, airframe.thrust_to_torque, getattr(controller.gains, "mass_thrust", 0.0)])
@@ -131,11 +131,11 @@ def find_start(
     airframe: Airframe,
     offset: NDArray | None = None,
 ) -> ReferenceMotion:
-    """Return the reference begun when it was flown: where it explains the commands best.
+    """Return the reference moved to the start at which it explains the commands best.
 
-    A logged setpoint shows start and place directly. Else `offset`, (3,) m, is the place of its origin; without it x
-    and y are its own, and its height is that which the thrust asks for, or of the first record where an integral makes
-    up for it.
+    Logged setpoints show start and place directly. Otherwise `offset`, (3,) m, is the place of its origin. Without an
+    offset x and y are its own, and its height follows from the thrust, or from the first record if an integral gain
+    hides an error of height.
     """
     if log.setpoint is not None:
         return _found_by_setpoints(log, reference, log.setpoint)
@@ -154,7 +154,7 @@ def find_start(
 def refine_start(
     log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe, search: float = _COARSE
 ) -> ReferenceMotion:
-    """Return the reference begun up to `search` s sooner or later, where it explains the torque best."""
+    """Return the reference moved in time by up to `search`, s, to where it explains the torque best."""
 
     def unexplained(later: float) -> float:
         return -recompute(log, reference.moved(later, np.zeros(3)), controller, airframe).torque
@@ -167,7 +167,7 @@ def refine_start(
 
 
 def choose_jerk(log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe) -> Controller:
-    """Return the controller, or where only that explains the torque, the one whose firmware feeds jerk otherwise."""
+    """Return the controller, with `feeds_jerk` inverted if only that explains the torque."""
     if not controller.by_lee or recompute(log, reference, controller, airframe).torque >= LEAST_EXPLAINED:
         return controller
     other = replace(controller, feeds_jerk=not controller.feeds_jerk)
@@ -177,7 +177,7 @@ def choose_jerk(log: FlightLog, reference: ReferenceMotion, controller: Controll
 def check_explained(
     log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
 ) -> Recomputed:
-    """Return the recomputed commands. Raises InputError where they explain too little, naming the likely gain."""
+    """Return the recomputed commands. Raises InputError if they explain too little; it names the likely cause."""
     found = recompute(log, reference, controller, airframe)
     if found.explained >= LEAST_EXPLAINED:
         return found
@@ -198,7 +198,7 @@ def check_explained(
 def likely_cause(
     log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe
 ) -> tuple[str, float]:
-    """Return the start or the one gain that explains most if changed, as text, and the fraction explained then."""
+    """Return the single change, of the start or a gain, that explains most, as text, and the fraction explained."""
     moved = refine_start(log, reference, controller, airframe, _SEARCHED)
     best = recompute(log, moved, controller, airframe).explained
     later = float(moved.time[0] - reference.time[0])

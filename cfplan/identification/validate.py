@@ -1,4 +1,4 @@
-"""Predict a logged flight by the model, and compare: what a dry run promises against what the vehicle did.
+"""Predict a logged flight by the model, and compare the prediction with the vehicle's motion.
 
 The model starts from the log's first record and flies the reference closed loop: body, sensors, poses, Kalman filter,
 controller with the gains that flew. Nothing is fitted to the deviation. It passes if rms and largest deviation agree
@@ -20,9 +20,9 @@ from cfplan.simulation.engine.estimated_loop import POSE_LATENCY, EstimatorInput
 from cfplan.simulation.engine.mellinger import FULL_STATE, ON_BOARD
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
-WITHIN, CORRELATED = 0.20, 0.95  # of rms and largest; of the deviations
+WITHIN, CORRELATED = 0.20, 0.95  # fraction, for rms and largest deviation; least correlation
 _RATE = 1000  # Hz, of the simulation
-_FIRST_POSE = 0.003  # s, where the log does not show the poses
+_FIRST_POSE = 0.003  # s, if the log does not show poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,16 +57,16 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Validation:
-    """One flight, predicted."""
+    """The prediction of one flight, compared with its log."""
 
     log: FlightLog
     reference: ReferenceMotion
     controller: Controller
     recomputed: Recomputed
     measured: Measured
-    predicted: NDArray  # (N, 3) m, where the model believes to be at each record
+    predicted: NDArray  # (N, 3) m, position estimated by the model at each record
     comparison: Comparison
-    ablations: Mapping[str, Comparison]  # by the piece of physics that is left out
+    ablations: Mapping[str, Comparison]  # by the part of the physics that is left out
 
 
 def validate(
@@ -76,7 +76,7 @@ def validate(
     airframe: Airframe,
     poses: EstimatorInput | None = None,
 ) -> Validation:
-    """Validate the model by a flight: its reference begun as flown, an airframe with the mass as weighed.
+    """Validate the model by a flight, with the reference at its actual start and an airframe of the weighed mass.
 
     Raises:
         InputError: the log has gaps or a crash, or the gains do not explain its commands; the hint names what to do.
@@ -97,7 +97,7 @@ def validate(
 
 
 def without_pieces(airframe: Airframe) -> dict[str, tuple[Airframe, bool]]:
-    """Return the airframe without each piece of physics, and whether the estimator flies."""
+    """Return the airframe without each part of the physics, and whether the estimator is simulated."""
     return {
         "thrust scale": (replace(airframe, thrust_scale=1.0, thrust_curvature=0.0), True),
         "drag": (replace(airframe, drag=(0.0, 0.0)), True),
@@ -108,7 +108,7 @@ def without_pieces(airframe: Airframe) -> dict[str, tuple[Airframe, bool]]:
 
 
 def poses_of(log: FlightLog, latency: float = POSE_LATENCY) -> EstimatorInput:
-    """Return the poses as logged; at 100 Hz without attitude, as of a single marker, where they are not."""
+    """Return the logged poses; without any, poses at 100 Hz without attitude, as from a single marker."""
     if not len(log.pose_time):
         return EstimatorInput(np.arange(_FIRST_POSE, log.duration, 0.01), latency, with_attitude=False)
     return EstimatorInput(
@@ -120,7 +120,7 @@ def predict(
     log: FlightLog, reference: ReferenceMotion, controller: Controller, airframe: Airframe, recomputed: Recomputed,
     poses: EstimatorInput, *, estimator: bool = True,
 ) -> NDArray:  # fmt: skip
-    """Return where a vehicle of this airframe believes to be at each record, (N, 3) m."""
+    """Return the predicted estimate of position of a vehicle with this airframe at each record, (N, 3) m."""
     mode = ON_BOARD
     if len(reference.sent) and not controller.by_lee:
         setpoints, times, mode = reference.sent, reference.sent_time, FULL_STATE
@@ -150,9 +150,9 @@ def compare(log: FlightLog, reference: ReferenceMotion, predicted: NDArray) -> C
 
 
 def _memory(controller: Controller, recomputed: Recomputed, airframe: Airframe, log: FlightLog) -> NDArray:
-    """Return the controller's integrals at the start: of a vehicle in trim, but for what its height asks for.
+    """Return the controller's integrals at the start: zero, as of a trimmed vehicle, except the integral of height.
 
-    The real vehicle's integrals also make up for motors and a centre of mass that differ, which the model has not.
+    The real vehicle's integrals also compensate unequal motors and an offset centre of mass, which the model lacks.
     """
     memory = np.zeros(len(recomputed.memory))
     gains = controller.gains

@@ -1,4 +1,4 @@
-"""A page about validated flights: curves of predicted and measured deviations, and what each piece explains."""
+"""Write a page about validated flights: predicted and measured deviations, and the effect of each piece of physics."""
 
 import html
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def comparison_rows(found: Comparison) -> list[tuple[str, str, str, str]]:
 
 
 def ablation_rows(validation: Validation) -> list[tuple[str, str, str, str]]:
-    """Return what is left of the prediction without each piece of physics."""
+    """Return rows that compare predictions without each part of the physics."""
     models = {"the full model": validation.comparison}
     models |= {f"without {name}": each for name, each in validation.ablations.items()}
     return [
@@ -44,7 +44,7 @@ COMPARISON_COLUMNS = ("", "measured", "predicted", "ratio")
 
 
 def measured_rows(validation: Validation) -> list[tuple[str, str]]:
-    """Return what the log shows of the vehicle and its estimate, then what it does not."""
+    """Return rows of the quantities measured in the log, then of those that it does not show."""
     measured = validation.measured
     units = {"position": "m", "velocity": "m/s", "tilt": "rad"}
     rows = list(measured.found.items())
@@ -56,7 +56,7 @@ def measured_rows(validation: Validation) -> list[tuple[str, str]]:
 
 
 def verdict(validation: Validation) -> str:
-    """Return in words whether the prediction holds."""
+    """Describe whether the prediction holds."""
     found = validation.comparison
     agreed = f"rms {found.ratio:.2f} and largest {found.largest_ratio:.2f} of the measured"
     holds = "holds" if found.passes else "does not hold"
@@ -81,7 +81,7 @@ def validation_to_dict(validation: Validation) -> dict[str, Any]:
 
 
 def write_validation_page(validations: Sequence[Validation], file: Path, *, overwrite: bool = False) -> None:
-    """Write the page whole or not at all. Raises InputError where it exists or cannot be written."""
+    """Write the page atomically. Raises InputError if it exists or cannot be written."""
     check_new_file(file, overwrite=overwrite)
     title = validations[0].log.name if len(validations) == 1 else f"{len(validations)} flights"
     body = f"<h1>{html.escape(title)}: predicted against measured</h1>" + "".join(map(_section, validations))

@@ -1,6 +1,6 @@
-"""Plans that continue a motion: the path may change while it is flown.
+"""Plans that continue a motion, so that the path can change in flight.
 
-A path is chosen from the state at a joint on (path/onward.py), and planned and certified like any other.
+The path begins in the state at a joint (path/onward.py); it is planned and certified like any other.
 """
 
 import math
@@ -36,24 +36,24 @@ from cfplan.vehicle.joint import joint_at
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
-SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², and s before that, with which the vehicle slows down to a lower speed
-STOPPING = 0.6  # s of the path left, on which a vehicle that stops comes to rest
-OVERSHOOT = 0.2  # s, for which a vehicle that speeds up goes on to do so
+SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², deceleration to a lower speed limit, and s before it begins
+STOPPING = 0.6  # s of the previous path, within which a vehicle that stops comes to rest
+OVERSHOOT = 0.2  # s, for which a vehicle that speeds up continues to do so
 ROOM = 0.005  # fraction of each limit that plans leave to the plan that continues them
-BETWEEN = 0.6  # of that, which limits may use up between points: so much less is done to the plan
-SEARCH_TIMEOUT = 2.0  # s, of a vehicle that rests
+BETWEEN = 0.6  # fraction of ROOM that may be used up between points, which saves rounds of tightening
+SEARCH_TIMEOUT = 2.0  # s, for a vehicle at rest
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
 _OTHERS = "give other waypoints"
 COARSER = 0.85  # fraction of the usual intervals: such plans take 0.05 % longer, and nine tenths of the time to make
 
 
 class NoWayError(InfeasibleError):
-    """No path that was tried leads from the state of a joint through the waypoints; from a later one it may."""
+    """No path that was tried leads from the state at a joint through the waypoints; one from a later joint may."""
 
 
 @dataclass(frozen=True, slots=True)
 class Continuation:
-    """A plan that begins in the state of a joint, or at rest."""
+    """A plan that begins in the state at a joint, or at rest."""
 
     plan: Plan
     reached: tuple[float, ...]  # s on its path, of each waypoint
@@ -73,10 +73,10 @@ def continue_plan(
 ) -> Continuation:
     """Return a certified plan that leaves a trajectory at `leave`, s, and goes through waypoints, (K, 3) m, to rest.
 
-    The first of the waypoints may be those of the path left, with s on that as `reached`, (J,): then the search begins
-    at what is left of it too. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is not to be
-    exceeded once the vehicle has slowed down to it, gently. Plans that `leave_room` keep ROOM from limits, so that they
-    can be continued; a state at a limit may only be continued by one that does not.
+    The first J waypoints may be those of the previous path, at s = `reached`, (J,), on it: then the search also begins
+    from the rest of that path. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is a limit
+    that holds once the vehicle has gently slowed down to it. With `leave_room` the plan keeps a fraction ROOM below
+    limits, so that it can be continued; a state at a limit may only have continuations without room.
 
     Raises:
         InputError: the waypoints are no waypoints, or the trajectory does not move then.
@@ -105,12 +105,12 @@ def continue_plan(
 def plan_from_rest(
     points: ArrayLike, limits: Limits, *, yaw_angle: float = 0.0, speed: float = math.inf
 ) -> Continuation:
-    """Return a certified plan from rest at the first of the points, (K, 3) m, through the others to rest at the last.
+    """Return a certified plan from rest at the first point, (K, 3) m, through the others to rest at the last one.
 
-    Where the few steps that there are in motion find no path, the whole search does, in up to SEARCH_TIMEOUT.
+    If the short search that is used in motion finds no path, the full search follows, for up to SEARCH_TIMEOUT.
 
     Raises:
-        InputError: they are no waypoints.
+        InputError: the points make no path.
         InfeasibleError: one lies outside the space, or none of the paths tried can be flown.
     """
     given = np.asarray(points, dtype=float)
@@ -145,10 +145,10 @@ def check_waypoints(points: NDArray, limits: Limits) -> None:
 def _first_certified(
     begins: list[Knots], departure: Departure, limits: Limits, speed: float, *, leave_room: bool
 ) -> Continuation | str:
-    """Return the first certified plan along the paths that descents from there find; or why there is none."""
+    """Return the first certified plan along the paths that descents from `begins` find; or why there is none."""
     begun, failure = time.perf_counter(), ""
     tried = replace(limits, plan=with_room(limits.plan, limits.airframe)) if leave_room else limits
-    at_rest = departure.state is None  # from where all of the motion may be slowed
+    at_rest = departure.state is None  # the whole motion may be slowed
     factor = min(speed / limits.plan.speed, 1.0) if at_rest else 1.0
     for knots in onward_paths(begins, departure, tried, math.inf if at_rest else speed):
         path, caps = knots.path, None
@@ -172,7 +172,7 @@ def _first_certified(
 
 
 def _slowing_to(speed: float, path: Path, start: BoundaryState) -> SpeedCaps:
-    """Return caps of speed along a path, that fall from what the vehicle has at its start."""
+    """Return speed caps along a path, which fall from the vehicle's speed at its start."""
     s = np.linspace(0.0, path.end, 4 * default_nodes(path, PLANNER) + 1)
     moving = np.linalg.norm(path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
@@ -188,7 +188,7 @@ def _slowing_to(speed: float, path: Path, start: BoundaryState) -> SpeedCaps:
 def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> PlanLimits:
     """Return limits that leave a fraction `room` of each to the plan that continues this one.
 
-    A state just at a limit can hardly be continued: what follows is all but decided, and exceeds it by rounding.
+    A state at a limit can hardly be continued: it leaves almost no choice, and rounding exceeds the limit.
     """
     hover, less = airframe.hover_thrust, 1.0 - room
     return PlanLimits(
@@ -204,9 +204,9 @@ def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> Pla
 
 
 def _plan(task: PlanningTask, limits: Limits, caps: SpeedCaps | None, factor: float) -> Plan:
-    """Return a plan, slowed by a factor, certified against the limits and `caps`, to which the task leaves room.
+    """Return a plan, slowed by a factor and certified against the limits and `caps`; the task's limits may be lower.
 
-    Raises InfeasibleError or NotCertifiedError where there is none.
+    Raises InfeasibleError or NotCertifiedError if there is none.
     """
     solution = plan_early(task, BETWEEN * ROOM) if task.limits is not limits.plan else plan_early(task)
     if solution.profile is None:

@@ -1,11 +1,11 @@
-"""Link loss as an assessment: how far beyond the walls each setpoint leaves the vehicle, were it the last one.
+"""Assess link loss: how far beyond the walls the vehicle ends if each setpoint is the last one.
 
-So do the setpoints of the stops. There are a hundred times as many of these as setpoints of the plan, so they are
-sampled: every tenth stop after every twelfth of its setpoints; and about each that so comes near a wall or sends more
-than harmless rates more densely, up to every stop after every other setpoint, as GRIDS says.
+Setpoints of the stops are assessed too. They are a hundred times as many as those of the plan, so they are sampled:
+every tenth stop after every twelfth of its setpoints, and more densely around those that come near a wall or send more
+than harmless rates, up to every stop after every other setpoint (GRIDS).
 
-Most setpoints are far from all walls, which a coarse look tells with a margin. What may be at fault is simulated with
-every motor lag.
+Most setpoints are far from all walls, which a coarse simulation shows with a margin. Those that may end outside are
+simulated with every motor lag.
 """
 
 from collections.abc import Callable

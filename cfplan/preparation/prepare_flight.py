@@ -1,9 +1,9 @@
-"""The way of the data from a path file to a mission, on one screen.
+"""Prepare a flight: the data flow from a path file to a mission, on one screen.
 
     path file → path → plan → certificate → bytes → dry run, link loss → stops → mission
 
-Each arrow is one function with frozen dataclasses in and out. `prepare_flight` is all of them in order; commands that
-need a part of the way call the parts.
+Each arrow is one function from frozen dataclasses to frozen dataclasses. `prepare_flight` calls all of them in order;
+commands that need only some steps call those.
 """
 
 from dataclasses import dataclass
@@ -121,8 +121,8 @@ def find_link_loss(
 ) -> LinkLoss:
     """Simulate that the pilot or the radio dies at every setpoint of the flight, and return the worst.
 
-    Where planning `simulated` that for the very same bytes, under these limits, its answer is taken. Raises
-    NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn.
+    If planning has `simulated` the same bytes under these limits, its result is used. Raises NotCertifiedError if the
+    vehicle comes down outside the walls, unless safety.yaml says only to warn.
     """
     with step(on_step, "link loss") as results:
         if simulated is not None and np.array_equal(simulated.payloads, encoded.payloads):

@@ -1,6 +1,6 @@
-"""A small flight that calls every compiled function that flights need, so that what is missing is compiled.
+"""Run a small flight that calls every compiled function that flights need, which compiles those not cached yet.
 
-`python -m cfplan.preparation.small_flight SAFETY_FILE PART` runs one part of it; no part needs another to have run.
+`python -m cfplan.preparation.small_flight SAFETY_FILE PART` runs one part of it; parts are independent.
 """
 
 import sys
@@ -32,7 +32,7 @@ from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_s
 from cfplan.simulation.virtual_crazyflie.log_variables import log_variables
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 
-NODES = 12  # grid intervals; so few that something exceeds limits between them
+NODES = 12  # grid intervals; few enough that limits are exceeded between nodes
 PLACES = ((-0.2, -0.2, -0.1), (0.2, 0.0, 0.0), (0.2, 0.2, 0.1))  # m from the middle of the space
 SMALL_PATH = "name: small flight\nwaypoints:\n"
 
@@ -43,7 +43,7 @@ def _plan(path_file: Path, limits: Limits) -> None:
     chosen.path.check()
     with suppress(CfplanError):  # there may be no model for this vehicle
         model = find_model(limits.airframe, limits.plan)
-        nodes = 1 + (model.window if model else NODES)  # more than a network is asked for: it is laid over these
+        nodes = 1 + (model.window if model else NODES)  # more than the network's window, so windows overlap
         _plan_along(chosen, limits, "learned", nodes, YawMode.FIXED)
     for yaw in YawMode:
         _plan_along(chosen, limits, "expert", NODES, yaw)
@@ -54,8 +54,8 @@ def _plan_along(path_file: PathFile, limits: Limits, planner: str, nodes: int, y
 
 
 def _prepare(path_file: Path, limits: Limits) -> None:
-    """Prepare a flight, and look at it as planning in the air does."""
-    path_file.write_text(path_file.read_text() + "shape: min-snap\n")  # choosing a path compiles much more
+    """Prepare a flight, and make the checks of planning in the air."""
+    path_file.write_text(path_file.read_text() + "shape: min-snap\n")  # choosing a path would compile much more
     prepared = prepare_flight(path_file, limits, FlightOptions(planner="minsnap"))
     prepare_on_board_flight(path_file, limits, FlightOptions(planner="minsnap"))
     encoded = prepared.encoded
@@ -71,7 +71,7 @@ def _prepare(path_file: Path, limits: Limits) -> None:
 
 
 def _simulate(_path_file: Path, limits: Limits) -> None:
-    """Let the virtual vehicle stand on the floor, and read all that it can log."""
+    """Let the virtual vehicle stand on the floor, and read all of its log variables."""
     vehicle = VirtualCrazyflie(limits.airframe)
     for _ in range(3):
         vehicle.advance(10)

@@ -119,7 +119,7 @@ def _along_the_path(record: Record) -> tuple[float, float]:
 
 
 def motor_thrust(record: Record) -> NDArray:
-    """Return (N, 4) N that the controller asked for, from the motors' PWM in the status messages."""
+    """Return the commanded thrusts, (N, 4) N, from the motors' PWM in the status messages."""
     status, header = record.status, record.header
     return command_shares(status.motor, status.battery_voltage, header.vehicle) * header.thrust_at_full_command
 

@@ -48,10 +48,10 @@ class Rehearsal:
     """What decides whether a flight passes; of a dry run the 95th percentile over its draws."""
 
     reason: str  # why it failed; empty when it passed
-    deviation: float  # m, worst distance from where the trajectory is at that time
-    deviation_time: float  # s, when that was
+    deviation: float  # m, largest distance from the trajectory at the same time
+    deviation_time: float  # s, when that occurred
     final_error: float  # m, from the end of the path when the simulation ends
-    speed: float  # m/s, highest that lasts for the limits' patience
+    speed: float  # m/s, highest value sustained for the limits' patience
     acceleration: float  # m/s², likewise
     angular_velocity: float  # rad/s, likewise
 
@@ -61,7 +61,7 @@ class Rehearsal:
         return not self.reason
 
     def require_passed(self) -> None:
-        """Raise NotCertifiedError where it failed."""
+        """Raise NotCertifiedError if it failed."""
         if self.reason:
             raise NotCertifiedError(self.reason, where="dry run", hint=_HINT)
 
@@ -244,7 +244,7 @@ def rehearse_setpoints(
 
 
 def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float = RATE) -> ClosedLoop:
-    """Return the flight of payloads, (N, 29) uint8 at `rate`, Hz, from a snapshot, (31,), on; the last one is kept."""
+    """Fly payloads, (N, 29) uint8 at `rate`, Hz, on from a snapshot, (31,); the last one is held."""
     times = np.arange(len(payloads)) / rate
     duration = times[-1] + SETTLING
     return fly_setpoints(decode(payloads), times, airframe, snapshot, duration)
@@ -288,13 +288,13 @@ def _expected(runs: Sequence[Rehearsal], limits: FlightLimits) -> Rehearsal:
 
 
 def _away(loop: ClosedLoop, wanted: NDArray) -> NDArray:
-    """Return (K,) m: how far the vehicle is from where it is wanted, (K, 3) m, each _STRIDE; inf where not known."""
+    """Return the distance from the desired position, (K, 3) m, each _STRIDE, (K,) m; inf if unknown."""
     error = np.linalg.norm(loop.position[::_STRIDE] - wanted, axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
 
 def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehearsal:
-    """Return what decides; `error`, (K,) m, is the distance from where it is wanted."""
+    """Return the figures that decide; `error`, (K,) m, is the distance from the desired position."""
     worst, patience = int(np.argmax(error)), limits.patience
     changes = np.diff(loop.velocity, axis=0)
     run = Rehearsal(
@@ -310,7 +310,7 @@ def _rehearsed(loop: ClosedLoop, error: NDArray, limits: FlightLimits) -> Rehear
 
 
 def _fault(run: Rehearsal, limits: FlightLimits) -> str:
-    """Return the first reason not to fly, or nothing. A position that is not a number counts as infinitely far."""
+    """Return the first reason not to fly, or an empty text. A NaN position counts as infinitely far."""
     if not run.deviation < limits.deviation.brake:
         return (
             f"the vehicle strays {run.deviation:.2f} m from the trajectory at {run.deviation_time:.2f} s; "

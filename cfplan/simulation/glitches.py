@@ -1,14 +1,14 @@
-"""Glitch margin: what a gap in setpoints, in poses, or in both does to the flight, beginning at any setpoint.
+"""Glitch margin: the effect of a gap in setpoints, in poses, or in both, beginning at any setpoint.
 
-The flight is simulated once, as in the dry run, and branches off at each setpoint. Through the gap the vehicle keeps
-its last setpoint; without poses it flies on by gyroscope and accelerometer, and what its attitude is wrong by makes its
-estimate drift. Then everything comes again: setpoints as far on as the clock is, and poses. The vehicle is lost where
-it then strays so far that the pilot would cut its motors, or leans so far that it turns over.
+The flight is simulated once, as in the dry run, and branches off at each setpoint. During the gap the vehicle keeps its
+last setpoint; without poses it flies on by gyroscope and accelerometer, and an error of its attitude makes the estimate
+drift. After the gap, the setpoints that are due by the clock arrive again, and poses. The vehicle is lost if it then
+deviates so far that the pilot would cut its motors, or tilts so far that it turns over.
 
-In 0.2 s a wrong attitude of 1° makes an estimate that misses 3 cm/s, which adds less than 3 cm to what a gap in
-setpoints does. So poses stop at every fifth setpoint alone, and between two of these the worse one counts, if it is
-worse than the flight with all its poses. Planning lets all gaps begin at every tenth setpoint only, where what is lost
-is far away: there too the worse one of two counts between them.
+In 0.2 s an attitude error of 1° makes an error of 3 cm/s in the estimate, which adds less than 3 cm to the effect of a
+gap in setpoints. So gaps in poses begin at every fifth setpoint only; between two of these the worse one counts, if it
+is worse than the flight with all its poses. In planning all gaps begin at every tenth setpoint only, if the vehicle is
+far from lost; there too the worse of two counts between them.
 """
 
 import math
@@ -29,23 +29,23 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
-AFTERWARDS = 1.0  # s that are simulated after the gap
+AFTERWARDS = 1.0  # s simulated after the gap
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
 WITHOUT_POSES_EVERY = 5  # setpoints
 SAMPLED_EVERY = 10  # setpoints, where the vehicle is far from lost
-NEARLY = 0.6  # usage of what is lost from which on it is not; by 0.15 it was exceeded at most in 26 flights, to 3 m/s
-_NEAR_WORST = 0.03  # usage, within which of the worst one each setpoint is looked at
-_STEP = 2  # ms, of the simulation from the gap on: motors saturate, which 4 ms show too mildly
+NEARLY = 0.6  # usage above which it is not far; in 26 flights to 3 m/s it rose by 0.15 at most between samples
+_NEAR_WORST = 0.03  # usage; around samples this close to the worst one every setpoint is simulated
+_STEP = 2  # ms, of the simulation from the gap on: steps of 4 ms underestimate saturation of the motors
 
 
 @dataclass(frozen=True, slots=True)
 class GlitchMoments:
-    """What a gap of GAP s that begins at each setpoint does, for each of KINDS."""
+    """The effect of a gap of GAP s that begins at each setpoint, for each of KINDS."""
 
     time: NDArray  # (N,) s of each setpoint from the first
-    deviation: NDArray  # (3, N) m, worst from the setpoints that are due, from the gap on
-    tilt: NDArray  # (3, N) rad, worst from the gap on
+    deviation: NDArray  # (3, N) m, largest distance from the setpoints that are due, from the gap on
+    tilt: NDArray  # (3, N) rad, largest from the gap on
     lost: NDArray  # (3, N) bool, whether the vehicle is lost
 
     @property
@@ -78,9 +78,9 @@ def glitch_at_every_setpoint(
 def glitch_at_sampled_setpoints(
     payloads: NDArray, limits: Limits, rate: float = RATE, *, start: NDArray | None = None
 ) -> GlitchMoments:
-    """Let a gap begin at every tenth setpoint of a flight, and at each where one of these nearly loses the vehicle.
+    """Let a gap begin at every tenth setpoint of a flight, and at each one near a gap that nearly loses the vehicle.
 
-    So at those about the worst one. Arguments as for glitch_at_every_setpoint.
+    The same holds near the worst of them. Arguments as for glitch_at_every_setpoint.
     """
     flight = _fly_without(payloads, limits, rate, GAP, start)
     wanted: NDArray = _wanted(len(payloads), limits)
@@ -94,13 +94,13 @@ def glitch_at_sampled_setpoints(
 
 
 def _wanted(count: int, limits: Limits) -> NDArray:
-    """Return, (3, N), which of KINDS begin at each setpoint; an exact estimate misses nothing without poses."""
+    """Return (3, N) bool: the KINDS of gap to simulate at each setpoint; an exact estimate needs no gaps in poses."""
     blind = _every(count, WITHOUT_POSES_EVERY) & (limits.link_loss.attitude_error > 0.0)
     return np.stack([np.ones(count, dtype=bool), blind, blind])
 
 
 def _every(count: int, step: int) -> NDArray:
-    """Return (N,) bool: so many setpoints apart, and the last."""
+    """Return (N,) bool: every `step`-th setpoint, and the last."""
     number = np.arange(count)
     return (number % step == 0) | (number == count - 1)
 
@@ -111,13 +111,13 @@ class _Flight(NamedTuple):
     rows: NDArray  # (N, 20) setpoints, as the controller takes them
     arrivals: NDArray  # (N,) ms
     snapshots: NDArray  # (N, 31) when they arrive
-    followed: NDArray  # (2, N) deviation, m, and tilt, rad, worst from each of them on
+    followed: NDArray  # (2, N) largest deviation, m, and tilt, rad, from each setpoint on
 
     def moments(self, found: NDArray, limits: Limits, rate: float) -> GlitchMoments:
-        """Return what gaps lead to, by those that were simulated, (2, 3, N), NaN for others.
+        """Return the effect of all gaps from those that were simulated, (2, 3, N), NaN for the others.
 
-        Between two that were the worse one counts. A gap in poses is no milder than none, and one in both no milder
-        than one in setpoints.
+        Between two simulated gaps the worse one counts. A gap in poses is no milder than none, and one in both no
+        milder than one in setpoints.
         """
         worst, number = np.zeros_like(found), np.arange(len(self.rows))
         for kind in range(len(KINDS)):
@@ -134,7 +134,7 @@ class _Flight(NamedTuple):
 
 
 def _fly_without(payloads: NDArray, limits: Limits, rate: float, gap: float, start: NDArray | None) -> _Flight:
-    """Fly without a gap, and look as far on from each setpoint as for one of `gap`, s."""
+    """Fly without a gap; from each setpoint, evaluate as long a time as for a gap of `gap`, s."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     state, first, watched = decode(payloads), np.zeros(1, dtype=np.int64), round(1000 * (gap + AFTERWARDS))

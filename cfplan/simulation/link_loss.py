@@ -1,20 +1,19 @@
-"""Link loss: where the vehicle goes by itself when its pilot or its radio dies, or its motors stop at once.
+"""Simulate link loss: where the vehicle goes if the pilot or the radio dies, or if its motors stop at once.
 
-By the firmware's own time-outs it holds the last setpoint, then levels out at that height, then stops its motors. While
-it levels out, the controller keeps the body rates of that last setpoint, which is why setpoints carry rates that brake
-(see flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is made the last one:
-the flight before is simulated once, in steps of 1 ms, and branches off at each setpoint in steps of 4 ms.
+By the firmware's time-outs the vehicle holds the last setpoint, then levels out at that height, then stops its motors.
+While it levels out, the controller keeps the body rates of the last setpoint, so setpoints carry rates that brake (see
+flight/setpoints/rate_trade.py). Where it comes down depends on the moment, so every setpoint is tried as the last one:
+the flight is simulated once, in steps of 1 ms, and a simulation in steps of 4 ms branches off at each setpoint.
 
-The motors may also stop at once, because the pilot cuts them, or the supervisor locks. Then the vehicle falls with the
-speed that it has, which from 2 m/s and a height of 1.2 m is a metre on: where it brakes late before a wall, farther
-than link loss takes it. So the box that it sweeps holds the fall from each setpoint too.
+The motors may also stop at once, because the pilot cuts them or the supervisor locks. Then the vehicle falls at its
+present velocity, which from 2 m/s and a height of 1.2 m takes it a metre on. If it was to brake late before a wall,
+that is farther than link loss takes it, so the box that the vehicle sweeps includes the fall from each setpoint.
 
-No poses come any more either. The vehicle then flies by gyroscope and accelerometer. An attitude that it has wrong by
-a little, and a velocity that it has wrong already, make it drift to a side, by as much wherever it is, so each place
-widens the box that the vehicle sweeps by how far that drift has come until then. An accelerometer that says too little
-makes it believe that it sinks, and climb: it is simulated so. One that says too much makes it come down sooner, with
-less thrust to brake by, which takes it some millimetres farther to the sides; that is simulated as well where the
-vehicle comes near a wall.
+Poses end as well. The vehicle then flies by gyroscope and accelerometer. Small errors of the estimated attitude and
+velocity make it drift to a side, independently of where it is, so the swept box is widened by the drift up to each
+moment. An accelerometer that reads too little makes the vehicle believe that it sinks, and climb; this is simulated.
+One that reads too much makes it come down sooner, with less thrust to brake, which takes it some millimetres farther to
+the sides; this is simulated as well if the vehicle comes near a wall.
 """
 
 import math
@@ -44,12 +43,12 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
 OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
 _PARTS = 9  # boxes of a sweep, if there are obstacles
-_STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; likewise where it only looks for walls
-_LONGEST = 4000  # ms that are simulated after the last setpoint, unless the vehicle lies on the floor before
-_NEAR = 0.1  # m from a wall, within which it also matters that the accelerometer may say too much
-ALLOWANCE = 0.1  # m, by which what had a first look alone may end farther out; 0.05 m at most in 51 flights, to 3 m/s
-_SLOW_ALLOWANCE = 0.07  # m, the same of slow motion; 0.068 m at most in 765 motions, far from the walls
-_FIRST_EVERY, _SLOW_EVERY, _FORESEEN_EVERY = 2, 8, 16  # setpoints between those that have a first look
+_STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
+_LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
+_NEAR = 0.1  # m from a wall, within which an accelerometer that reads too much is simulated too
+ALLOWANCE = 0.1  # m, by which a first look may underestimate the distance; at most 0.05 m in 51 flights, to 3 m/s
+_SLOW_ALLOWANCE = 0.07  # m, the same for slow motion; at most 0.068 m in 765 motions, far from the walls
+_FIRST_EVERY, _SLOW_EVERY, _FORESEEN_EVERY = 2, 8, 16  # setpoints from one first look to the next
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,36 +72,36 @@ class LinkLoss:
 
 @dataclass(frozen=True, slots=True)
 class LinkLossMoments:
-    """What the vehicle sweeps after each setpoint, were it the last one: the worst of all motor lags."""
+    """The space that the vehicle sweeps if each setpoint is the last one: the worst of all motor lags."""
 
     time: NDArray  # (N,) s of each setpoint from the first
     place: NDArray  # (N, 3) m, of each setpoint
-    boxes: NDArray  # (N, S, 2, 3) m, low and high corners of what the vehicle sweeps down to the floor, in S parts
+    boxes: NDArray  # (N, S, 2, 3) m, low and high corners of the space swept down to the floor, in S parts
     beyond: NDArray  # (N,) m beyond a wall or the ceiling, or into an obstacle; negative inside
-    face: NDArray  # (N,) int, the number of that face of the space, or of the nearest one
+    face: NDArray  # (N,) int, number of that face of the space, or of the nearest one
     distance: NDArray  # (N,) m, horizontally from the setpoint to the far corner of the box
     snapshots: NDArray  # (L, N, 31) at each setpoint, see `engine.layout`, for each motor lag; (L, 0, 31) within stops
 
     @property
     def worst(self) -> LinkLoss:
-        """Return the setpoint after which the vehicle ends farthest out; what is not a number is farthest."""
+        """Return the setpoint after which the vehicle ends farthest out; NaN counts as farthest."""
         at = int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
         at_obstacle = bool(self.face[at] >= SIDES)
         return LinkLoss(float(self.time[at]), float(self.distance[at]), float(self.beyond[at]), at_obstacle)
 
     @property
     def low(self) -> NDArray:
-        """Return (N, 3) m, the low corner of all that the vehicle sweeps."""
+        """Return the low corner of the space that the vehicle sweeps, (N, 3) m."""
         return np.asarray(self.boxes[:, :, 0].min(axis=1))
 
     @property
     def high(self) -> NDArray:
-        """Return (N, 3) m, the high corner of all that the vehicle sweeps."""
+        """Return the high corner of the space that the vehicle sweeps, (N, 3) m."""
         return np.asarray(self.boxes[:, :, 1].max(axis=1))
 
 
 def simulate_link_loss(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLoss:
-    """Lose the link at every setpoint of a flight, (N, 29) uint8 at `rate`, Hz; return what ends farthest out."""
+    """Lose the link at every setpoint of a flight, (N, 29) uint8 at `rate`, Hz; return the worst case."""
     return link_loss_at_every_setpoint(payloads, limits, rate).worst
 
 
@@ -123,10 +122,11 @@ def link_loss_at_every_setpoint(
 def link_loss_near_walls(
     payloads: NDArray, limits: Limits, within: float, rate: float = RATE, starts: NDArray | None = None
 ) -> LinkLossMoments:
-    """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst of all.
+    """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst one.
 
-    What a first look says to end farther than that and ALLOWANCE inside is taken to end ALLOWANCE farther out than it
-    says. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half of its time.
+    Setpoints that end farther inside than `within` and ALLOWANCE by a first look are not simulated closely: they count
+    as ending ALLOWANCE farther out. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half
+    the time.
     """
     return _look_at_some(payloads, limits, rate, starts, within)
 
@@ -136,7 +136,7 @@ def link_loss_at_walls(
 ) -> LinkLossMoments:
     """Lose the link after each setpoint that may leave the vehicle beyond a wall.
 
-    As link_loss_near_walls() does, but of a flight that ends inside from everywhere it does not find the worst moment.
+    Like link_loss_near_walls(), but if every setpoint ends inside, the worst moment is not found.
     """
     return _look_at_some(payloads, limits, rate, starts, None)
 
@@ -144,14 +144,14 @@ def link_loss_at_walls(
 def foreseen_link_loss(
     payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
 ) -> LinkLossMoments:
-    """Return about how each setpoint ends, were it the last one, by a first look at few of them."""
+    """Return an estimate of where the vehicle ends after each setpoint, from a first look at few of them."""
     return _foreseen(payloads, limits, rate, starts, _FORESEEN_EVERY)
 
 
 def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
     """Lose the link at setpoints of take-off, of the way to the start or of landing, (N, 29) uint8 at `rate`, Hz.
 
-    A first look at every eighth one tells unless it ends near a wall.
+    A first look at every eighth one suffices unless it ends near a wall.
     """
     found, state = _foreseen(payloads, limits, rate, None, _SLOW_EVERY), decode(payloads)
     if found.worst.beyond < -_SLOW_ALLOWANCE:
@@ -165,11 +165,11 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
 def link_loss_within_stops(
     stops: NDArray, starts: NDArray, limits: Limits, forks: NDArray, rate: float = RATE, *, coarsely: bool = False
 ) -> LinkLossMoments:
-    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after those of their setpoints where `forks`, (K, M).
+    """Lose the link in K stops, (K, M, 29) uint8 at `rate`, Hz, after the setpoints selected by `forks`, (K, M).
 
     Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
     hold them. Returns a moment for each fork, one stop after another; times are from the first setpoint of the stop.
-    Coarsely, by a first look, what ends farther out than it seems does so by less than ALLOWANCE.
+    If `coarsely`, by a first look, the vehicle ends at most ALLOWANCE farther out than returned.
     """  # six, and what it is about
     rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
     some = slice(_middle(limits), _middle(limits) + 1) if coarsely else slice(None)
@@ -182,17 +182,17 @@ def link_loss_within_stops(
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
-    """Return, of snapshots (L, ...) for each motor lag, those with the lag that the airframe has by safety.yaml."""
+    """Return those of the snapshots, (L, ...) for each motor lag, that have the airframe's lag in safety.yaml."""
     return np.asarray(snapshots[_lags(limits).index(limits.airframe.motor_time_constant)])
 
 
 def as_most_sluggish(snapshots: NDArray, limits: Limits) -> tuple[Airframe, NDArray]:
-    """Return the airframe with the longest motor lag that is simulated, and of snapshots (L, ...) those with it."""
+    """Return the airframe with the longest simulated motor lag, and those of the snapshots, (L, ...), that have it."""
     return replace(limits.airframe, motor_time_constant=_lags(limits)[-1]), np.asarray(snapshots[-1])
 
 
 def _begins(state: FullStateSetpoints, limits: Limits, starts: NDArray | None) -> NDArray:
-    """Return the snapshots, (L, 31), that a flight begins from with each motor lag."""
+    """Return the snapshots, (L, 31), at the beginning of a flight, for each motor lag."""
     return np.stack([hovering_snapshot(limits.airframe, state)] * len(_lags(limits))) if starts is None else starts
 
 
@@ -217,7 +217,7 @@ def _flown_each(rows: NDArray, limits: Limits, airframes: NDArray, rate: float, 
 
 
 def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, every: int) -> LinkLossMoments:
-    """Return about how each setpoint ends, by a first look at one in `every`."""
+    """Return an estimate of where each setpoint ends, from a first look at one in `every`."""
     state, middle = decode(payloads), _middle(limits)
     rows, airframe = setpoint_rows(state), _airframes(limits)[middle : middle + 1]
     snapshots = _flown(rows, limits, airframe, rate, _begins(state, limits, starts)[middle : middle + 1])
@@ -228,7 +228,7 @@ def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | 
 def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
     """Return boxes, (N, S, 2, 3), by one motor lag, coarse steps and one in `every` setpoints.
 
-    `snapshots`, (N, 31), are those of that lag. Between two setpoints the vehicle sweeps what it does at either.
+    `snapshots`, (N, 31), are those of that lag. A setpoint between two simulated ones gets the boxes of both.
     """
     number, middle = np.arange(len(rows)), _middle(limits)
     some = (number % every == 0) | (number == len(rows) - 1)
@@ -241,7 +241,7 @@ def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -
 def _look_at_some(
     payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, within: float | None
 ) -> LinkLossMoments:
-    """Look closely at what may end `within` m of a wall, and at the worst; at what may end outside, where None."""
+    """Simulate closely the setpoints that may end `within` m of a wall, and the worst; None: that may end outside."""
     state = decode(payloads)
     rows, number = setpoint_rows(state), np.arange(len(payloads))
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
@@ -253,7 +253,7 @@ def _look_at_some(
     _look_again(boxes, rows, snapshots, limits, near)
     found = _judge(number / rate, state.position, boxes, limits, snapshots)
     others = ~near & (most > found.beyond[near].max(initial=-np.inf))
-    if within is not None and others.any():  # which may be worse
+    if within is not None and others.any():  # these may be worse
         _look_again(boxes, rows, snapshots, limits, others)
         found, near = _judge(number / rate, state.position, boxes, limits, snapshots), near | others
     return replace(found, beyond=np.where(near, found.beyond, most))
@@ -265,7 +265,7 @@ def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limit
 
 
 class _Forks(NamedTuple):
-    """Where the link is lost, and how closely that is looked at."""
+    """Where the link is lost, and the time step of the simulation from there."""
 
     setpoints: NDArray  # (N, 20)
     rows: NDArray  # (F,) int, the last setpoints
@@ -275,7 +275,7 @@ class _Forks(NamedTuple):
 
 
 def _swept(forks: _Forks, limits: Limits) -> NDArray:
-    """Return the boxes, (F, S, 2, 3) m, that all vehicles sweep from the forks."""
+    """Return the boxes swept from the forks, (F, S, 2, 3) m."""
     error = limits.link_loss.vertical_acceleration_error
     swept = _united([_fall(forks, limits), _go_on(forks, limits, error)])
     beyond, _ = limits.space.swept(swept)
@@ -287,7 +287,7 @@ def _swept(forks: _Forks, limits: Limits) -> NDArray:
 
 
 def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
-    """Let vehicles fly on with their last setpoints; the accelerometer says `error`, m/s², too little."""
+    """Fly on with the last setpoints; the accelerometer reads `error`, m/s², too little."""
     off, step = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER, forks.step
     level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
     return _leave(forks, limits, error, _alone(forks, limits)._replace(
@@ -296,7 +296,7 @@ def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
 
 
 def _fall(forks: _Forks, limits: Limits) -> NDArray:
-    """Let the motors stop at once; a first look is at both extremes of motor lag, though the flight before was not."""
+    """Stop the motors at once; a first look uses both extremes of motor lag, though the flight before used one."""
     airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
     snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
     forks = forks._replace(snapshots=snapshots, airframes=airframes)
@@ -322,7 +322,7 @@ def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> N
 
 
 def _drift(limits: Limits, off: int, step: int) -> NDArray:
-    """Return how far errors of attitude and velocity may have carried the vehicle to a side after each step, m."""
+    """Return the drift to a side through errors of attitude and velocity, after each step, m."""
     wrong, airframe = limits.link_loss, limits.airframe
     push, damping = GRAVITY * math.tan(wrong.attitude_error), max(airframe.drag[0] / airframe.mass, 1e-6)
     time = 0.001 * step * np.arange(_LONGEST // step + 1)
@@ -333,7 +333,7 @@ def _drift(limits: Limits, off: int, step: int) -> NDArray:
 
 
 def _judge(time: NDArray, place: NDArray, swept: NDArray, limits: Limits, snapshots: NDArray) -> LinkLossMoments:
-    """Return what sweeping boxes, (N, S, 2, 3) m, comes to."""
+    """Compare swept boxes, (N, S, 2, 3) m, with the space."""
     beyond, face = limits.space.swept(swept)
     away = np.maximum(place - swept[:, :, 0].min(axis=1), swept[:, :, 1].max(axis=1) - place)[:, :2]
     return LinkLossMoments(time, place, swept, beyond, face, np.hypot(away[:, 0], away[:, 1]), snapshots)
@@ -361,5 +361,5 @@ def _lags(limits: Limits) -> list[float]:
 
 
 def _middle(limits: Limits) -> int:
-    """Return which of the motor lags has the first look."""
+    """Return the index of the motor lag of a first look."""
     return len(_lags(limits)) // 2

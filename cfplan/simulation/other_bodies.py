@@ -1,6 +1,6 @@
 """Bodies that others have written, stepped as cfplan steps its own: RotorPy's, and those of drone-models.
 
-Each takes a state as in `engine/layout.py`, (17,), and what each motor is asked for, (4,) N, and returns the
+Each takes a state as in `engine/layout.py`, (17,), and each motor's commanded thrust, (4,) N, and returns the
 state a while later. Both packages have rotor speeds where cfplan has thrusts; the curve of thrust over speed is known,
 so a thrust is as good as a speed.
 

@@ -90,7 +90,7 @@ def recertify(record: Record) -> Recertified:
             limits = plan.limits
         told, checksum = commitments.payloads[number], int(commitments.checksum[number])
         made = _committed(timeline, splice, plan, limits, told, checksum, number)
-        begins = int(commitments.splice[number:].min())  # what is before that setpoint is left by no other plan
+        begins = int(commitments.splice[number:].min())  # no other plan leaves before that setpoint
         timeline = made.accepted(spliced(timeline.commitment, made.proposal, begins))
         stops += timeline.stopping
         setpoints += len(commitments.payloads[number]) // PAYLOAD_SIZE
@@ -109,7 +109,7 @@ def _plan_of(record: Record, checksum: int) -> Plan | None:
 
 
 def _beginning(record: Record, plans: list[Plan | None]) -> tuple[Timeline, Plan | None]:
-    """Return the timeline before anything was asked for, and the plan behind it; None for a hover."""
+    """Return the timeline before the first request, and its plan; None for a hover."""
     if (record.folder / PLAN_FILE).is_file():
         first = load_plan(record.folder / PLAN_FILE)
         ends = first.path(np.array([0.0, first.path.end]))
@@ -184,7 +184,7 @@ def _goes_on(onward: Onward, told: NDArray, limits: Limits) -> bool:
 
 
 def _stopped(timeline: Timeline, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> Replanned:
-    """Return a stop that was asked for, certified again. Raises InputError where there is none."""
+    """Return a requested stop, certified again. Raises InputError if there is none."""
     for duration in STOPS:
         with suppress(CfplanError):
             made = stop_within(timeline, splice, duration, limits)

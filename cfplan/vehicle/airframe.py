@@ -16,7 +16,7 @@ MOTOR_TORQUE_SIGNS = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]], 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """How far vehicles of one kind differ from its airframe: half the width of 95 %, as fractions of each value.
+    """Spread of vehicles of one kind around their airframe: half the width of the 95 % interval, as fractions.
 
     Of public flights of four vehicles, and of one vehicle from flight to flight.
     """
@@ -47,13 +47,13 @@ class Airframe:
     velocity_moment: tuple[float, float] = (0.0, 0.0)
     """N m per m/s, moment about x by velocity along y, and about -y by velocity along x, in body axes."""
     thrust_scale: float = 1.0
-    """Thrust that the motors give in hover per thrust that the controller asks for."""
+    """Actual over commanded thrust in hover."""
     thrust_curvature: float = 0.0
-    """Fraction by which, about hover, thrust grows more slowly than in proportion to what is asked for."""
+    """Fraction by which thrust around hover grows more slowly than in proportion to the command."""
     lift_with_speed: float = 0.0
     """1/(m/s)², gain of thrust at equal rotor speed per squared speed in the rotor plane."""
     voltage_sag: float = 0.0
-    """1/V, fraction of thrust lost per volt of battery; 0 where the firmware compensates it."""
+    """1/V, fraction of thrust lost per volt of battery; 0 if the firmware compensates it."""
     motor_curve: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """The firmware's cubic from a motor's voltage, V, to thrust, N, and the thrust of its full command; zeros: none."""
     spread: Spread = Spread()
@@ -78,7 +78,7 @@ class Airframe:
 UNPLANNED = frozenset(
     ("velocity_moment", "thrust_scale", "thrust_curvature", "lift_with_speed", "voltage_sag", "motor_curve", "spread")
 )
-"""Fields that a simulated vehicle has and plans do not know, so that datasets need not hold them."""
+"""Fields that affect simulation but not plans, so that datasets need not hold them."""
 
 
 def airframe_of(values: Mapping[str, Any]) -> Airframe:

@@ -108,11 +108,11 @@ AS_FLOWN: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         },
     }
 )  # fmt: skip
-"""What public flights show of each kind beside, by field: for predictions of vehicles as they are."""
+"""Further values of each kind from public flights, by field, to predict real vehicles."""
 
 
 def as_flown(airframe: Airframe) -> Airframe:
-    """Return a shipped airframe with what public flights show of its kind; others are as their files say."""
+    """Return a shipped airframe with the values that public flights show; others are as in their files."""
     return replace(airframe, **AS_FLOWN.get(airframe.name, {}))
 
 

@@ -1,7 +1,7 @@
-"""Motor commands as a vehicle logs them: PWM after battery compensation, and the shares of full command before it.
+"""Convert logged motor commands: PWM after battery compensation to and from fractions of the full command before it.
 
-The firmware turns a share of its full command into thrust, thrust by a cubic of its platform's propeller build into the
-motor's voltage, and that over the battery's into PWM. Firmware without compensation logs the shares themselves.
+The firmware converts a fraction of its full command to thrust, thrust to motor voltage by a cubic of the propeller
+build, and the ratio of motor to battery voltage to PWM. Firmware without compensation logs the fractions themselves.
 """
 
 import numpy as np
@@ -11,12 +11,12 @@ from cfplan.vehicle.airframe import Airframe
 
 FULL_COMMAND = 65535  # of a motor, 16 bits
 _LEAST_VOLTAGE = 2.0  # V of the battery, below which the firmware turns the motors off
-_UNIQUE = 1.0 - 1e-6  # of the least thrust: rounding must not turn a motor off that runs at it
+_UNIQUE = 1.0 - 1e-6  # of the least thrust, so that rounding does not turn off a motor at that thrust
 _ROUNDS = 40  # of bisection: to 1e-11 V
 
 
 def command_shares(pwm: NDArray, battery_voltage: NDArray, airframe: Airframe) -> NDArray:
-    """Return the share of the full command, (N, 4), of motors whose PWM, (N, 4) 16 bits, was logged at (N,) V."""
+    """Return the fraction of the full command, (N, 4), from PWM, (N, 4) 16 bits, logged at battery voltages, (N,) V."""
     share = np.asarray(pwm) / FULL_COMMAND
     if not any(airframe.motor_curve):
         return share
@@ -34,7 +34,7 @@ def command_share(pwm: float, battery_voltage: float, airframe: Airframe) -> flo
 
 
 def compensated_pwm(share: float, battery_voltage: float, airframe: Airframe) -> float:
-    """Return the PWM, 16 bits, by which a motor is given a share of the full command at a battery's voltage, V."""
+    """Return the PWM, 16 bits, for a fraction of the full command at a battery voltage, V."""
     if not any(airframe.motor_curve):
         return share * FULL_COMMAND
     *cubic, full = airframe.motor_curve

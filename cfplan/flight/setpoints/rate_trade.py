@@ -1,7 +1,7 @@
 """The rate trade: body rates sent as a turn of the attitude, so that a vehicle whose setpoints stop levels out.
 
 The Mellinger controller's torque about body x and y is 2 kR sin φ + kw (ω_sent - ω), φ being the turn from the attitude
-to the wanted one. Any share of the rate can therefore be moved into the wanted attitude, and the torque stays the same:
+to the wanted one. Any fraction of the rate can therefore be moved into the wanted attitude without changing the torque:
 
     Δ  = (ω - ω_sent)_xy                         ω: the rate to fly
     φ  = asin(|Δ| kw / 2kR) along Δ              in body axes, no z
@@ -10,10 +10,10 @@ to the wanted one. Any share of the rate can therefore be moved into the wanted 
     a' = T / cos∠(z(q), z(q')) · z(q') - g       T: specific thrust; it acts along the true axis, hence the cosine
 
 This matters once setpoints stop: the firmware then wants a level attitude, yet keeps the last roll and pitch rates, and
-settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the rates that are sent are only those with
-which that tilt does good: it brakes what speed will be left, v_left = 0.41 v + 0.089 s · a(t + 0.15 s), horizontally,
-as the vehicle first holds its last place for half a second; and within 1.5 m of a wall it leans away from that wall,
-the more the nearer, so that an error of its attitude does not carry it there; it leans away from obstacles as well.
+settles at a tilt of asin(ω_sent kw / 2kR), which at 3 rad/s is 25°. So the only rates sent are those whose tilt helps:
+it brakes the horizontal speed that remains after the vehicle has first held its last place for half a second, v_left =
+0.41 v + 0.089 s · a(t + 0.15 s). Within 1.5 m of a wall it leans away from it, more so the nearer the wall, so that an
+error of its attitude does not carry it there; it leans away from obstacles as well.
 How much depends on how long level-out lasts until the motors stop (LevelOut).
 
 Two bounds leave more of the rate as a rate: φ grows to 90° as |Δ| nears 7 rad/s, so at most TRADED_RATE_MAX is traded;
@@ -22,10 +22,10 @@ hardly defined. In the axes of q̂, with n the direction of φ × z, and u the v
 
     z(q')·u = u_n sin φ + u_z cos φ >= cos LEAN_MAX    ⟺    φ <= atan2(u_n, u_z) + acos(cos LEAN_MAX / |(u_n, u_z)|)
 
-which changes steadily along a motion. Where the attitude to fly leans as far itself, only what rights it is traded.
+which changes steadily along a motion. If the attitude to fly itself leans that far, only righting rates are traded.
 
 In flight the air turns the body in proportion to its velocity (Airframe.velocity_moment), and the controller must hold
-against it. What is traded is therefore ω + M v, with M v the rate for which kw gives just that torque.
+against it. The rate that is traded is therefore ω + M v; with M v, kw gives exactly that torque.
 """
 
 import math
@@ -56,11 +56,11 @@ from cfplan.vehicle.panels import (
 from cfplan.vehicle.rotations import dot, heading_of, matrices_of, matrix_rows, norms, product, transpose, turn_rows
 from cfplan.vehicle.trigonometry import cosine, sine
 
-BRAKE_LEAD = 0.15  # s by which the acceleration that tells the speed left is ahead of the setpoint
-SPEED_LEFT = 0.41  # share of the velocity that is left when the firmware begins to level out
+BRAKE_LEAD = 0.15  # s by which the acceleration in the formula of the remaining speed is ahead of the setpoint
+SPEED_LEFT = 0.41  # fraction of the velocity that remains when the firmware begins to level out
 SPEED_GAINED = 0.089  # s, speed gained until then for each m/s² of acceleration
-WALL_LEAD = 0.3  # s by which the place that tells how near a wall will be is ahead of the setpoint
-TRADED_RATE_MAX = 4.5  # rad/s; what exceeds it is sent as a rate, as φ grows to 90° at 7 rad/s
+WALL_LEAD = 0.3  # s by which the place whose distance to walls counts is ahead of the setpoint
+TRADED_RATE_MAX = 4.5  # rad/s; the excess is sent as a rate, as φ grows to 90° at 7 rad/s
 LEAN_MAX = math.radians(60.0)  # of the thrust that is sent; plans under the shipped limits reach 45°
 _LEAST_LIFT = math.cos(LEAN_MAX)
 ATTITUDE_AGE = 0.007
@@ -73,7 +73,7 @@ _ROWS_AHEAD = 2  # of 10 ms, that rates are sent ahead
 
 @dataclass(frozen=True, slots=True)
 class LevelOut:
-    """What level-out is to do, by how long it lasts until the motors stop."""
+    """Parameters of level-out, by its duration until the motors stop."""
 
     braking: float  # 1/s, deceleration over the speed left
     rate_max: float  # rad/s, of the rates that are sent for it
@@ -93,7 +93,7 @@ UNTIL_TIMEOUT = LevelOut(braking=1.0, rate_max=0.6, wall_reach=1.5, wall_stiffne
 
 @dataclass(frozen=True, slots=True)
 class AttitudeGains:
-    """What of the firmware the trade rests on: gains by their names in the group ctrlMel, with its defaults."""
+    """The firmware's attitude gains, by their names in the group ctrlMel, with the defaults there."""
 
     kR_xy: float = MellingerGains().kR_xy
     kw_xy: float = MellingerGains().kw_xy
@@ -138,7 +138,7 @@ def held_against_air(motion: FullStateSetpoints, gains: AttitudeGains, sign: flo
 
 
 GAIN_TOLERANCE = 0.05
-"""Share by which 2 kR / kw of a vehicle may differ from that of the packets; 10 % makes deviations of up to 3.1 cm."""
+"""Fraction by which 2 kR / kw of a vehicle may differ from that of the packets; 10 % makes up to 3.1 cm deviation."""
 
 
 def trade_rates(

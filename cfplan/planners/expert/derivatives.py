@@ -1,7 +1,7 @@
 """Constraints and penalty at one point as CasADi expressions, and their derivatives by spline coefficients.
 
-Everything physical at a point follows from h and yaw with their derivatives there, kept in node units (s counted in
-grid steps, h over a scale), which makes the expressions the same for every path and every N:
+Every physical quantity at a point follows from h and yaw with their derivatives there. They are in node units (s in
+grid steps, h divided by a scale), so that the expressions are the same for every path and every N:
 
     given yaw   (x, x', x'', x''')                      h = scale · x
     free yaw    (x, x', x'', x''', ψ, ψ', ψ'')
@@ -61,18 +61,18 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
     """Return values and derivatives at one point, as CasADi functions.
 
     Both take the coefficients, (k,), point data, common data and weights of the penalties, derivatives also Σ and the
-    rest of barrier.TERMS, (ROWS,) each. They give what Kernels do.
+    rest of barrier.TERMS, (ROWS,) each. They return the same as Kernels.
     """
     inputs, rows, penalty = point_expressions(free_yaw)
     here, place = inputs[0], inputs[1][PLACE]
     terms = [casadi.SX.sym(name, ROWS) for name in TERMS]
     sigma, multipliers = terms[:2]
-    # Differentiated by what holds at the point itself, which is sparser, and led to the coefficients from there.
+    # Differentiated by h and yaw at the point, which is sparser, then by the coefficients through the chain rule.
     jacobian = casadi.jacobian(rows, here)
     gradients = casadi.horzcat(casadi.gradient(penalty, here), casadi.mtimes(jacobian.T, casadi.horzcat(*terms[1:])))
     hessian = casadi.jacobian(casadi.gradient(penalty + casadi.dot(multipliers, rows), here), here)
     hessian += casadi.mtimes(jacobian.T, casadi.repmat(sigma, 1, here.numel()) * jacobian)
-    hessian = casadi.tril2symm(casadi.tril(hessian))  # what lies above is not computed
+    hessian = casadi.tril2symm(casadi.tril(hessian))  # the upper triangle is not computed
     by_here = casadi.Function("by_here", [*inputs, *terms], [rows, penalty, jacobian, gradients, hessian])
 
     coefficients = casadi.SX.sym("coefficients", here.numel())
@@ -95,7 +95,7 @@ def point_kernels(free_yaw: bool) -> tuple[casadi.Function, casadi.Function]:
 
 
 def _here_by_coefficients(place: casadi.SX, free_yaw: bool) -> casadi.SX:
-    """Return the matrix that leads from the coefficients to h, and yaw, with derivatives at a place in the interval."""
+    """Return the matrix from the coefficients to h, and yaw, with derivatives at a place in the interval."""
     z = casadi.SX.sym("z", variables(free_yaw))
     h, at_node = h_within(place, *casadi.vertsplit(z)[:4]), casadi.DM(profile_spline.AT_NODE)
     if not free_yaw:

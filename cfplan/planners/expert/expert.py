@@ -6,15 +6,15 @@ quadrature, with small penalties on angular acceleration, yaw rate and roughness
 interval, where h''' and ψ'' jump, and at points inside (problem.py). Three strategies search for the solution:
 
     OPTIMUM      from a guess to the optimum
-    early()      from a guess to within about 0.02 % of it, in half the time; gives up early where there is no solution
-    refining()   as near, from a profile that nearly keeps its limits, in a fraction of the steps
+    early()      from a guess to within about 0.02 % of it, in half the time; gives up early if there is no solution
+    refining()   as near, from a near-feasible profile, in a fraction of the steps
 
-Between the points a limit can still be exceeded by a percent or so. The solution is checked densely; where it exceeds
-a limit, that limit is lowered by as much in that interval alone, and the problem solved again from there, which takes
-a few iterations and costs about a hundredth of a percent in time. Long paths are planned in windows (windows.py).
+Between the points a limit can still be exceeded by about a percent. The solution is checked densely; in each interval
+that exceeds a limit, that limit is lowered by the excess, and the problem is solved again from there, which takes a few
+iterations and makes the flight about 0.01 % longer. Long paths are planned in windows (windows.py).
 
-Where the path rests (γ' = γ'' = γ''' = 0) h has no bearing on motion and hardly any on its first derivatives: left
-alone, an optimiser lets it run away or stop short. There h stays constant over the first, or last, interval.
+At a rest (γ' = γ'' = γ''' = 0) h has no effect on the motion and hardly any on its first derivatives, so an optimiser
+lets it diverge or fall to zero. There h stays constant over the first, or last, interval.
 """
 
 import math
@@ -57,10 +57,10 @@ def plan_expert(task: PlanningTask, *, window: WindowSize = TUNING.window) -> So
     """Plan the fastest profile that keeps every limit of the task.
 
     Yaw is that of the Hopf fibration. FIXED holds the yaw angle, TANGENT follows the horizontal direction of flight;
-    both are laid out before the speed (see YawSpline), which then respects what turning takes. FREE leaves yaw to the
+    both are fixed before the speed is planned (see YawSpline), which allows for the turning. FREE leaves yaw to the
     optimiser, from a first yaw between that angle and a quarter turn more, as the paper has it. A start or end state
     brings its own yaw in every mode. A path longer than `window` is planned window by window, and in one piece if one
-    of them fails. At the task's deadline there is no profile, unless only limits between points were still exceeded.
+    of them fails. If the task's deadline passes there is no profile, unless all limits at points were kept by then.
 
     Raises:
         InputError: fewer nodes than the path needs.
@@ -69,20 +69,20 @@ def plan_expert(task: PlanningTask, *, window: WindowSize = TUNING.window) -> So
 
 
 def plan_early(task: PlanningTask, enough: float = TUNING.enough) -> Solution:
-    """Plan as plan_expert() does, within about 0.02 % of the fastest, by one search: it takes half the time.
+    """Plan like plan_expert(), to within about 0.02 % of the fastest, by one search in half the time.
 
-    It takes less where the limits are to leave room, of which `enough`, a fraction of a limit, may be used between
-    points. Raises as plan_expert() does.
+    If the limits leave room, planning takes less: `enough`, a fraction of a limit, may be exceeded between points.
+    Raises as plan_expert() does.
     """
     return _plan(task, TUNING.early_window, early, enough)
 
 
 def can_begin(task: PlanningTask) -> bool:
-    """Return whether the beginning of a task that starts in motion can be planned, whatever comes behind it.
+    """Return whether the beginning of a task that starts in motion can be planned, regardless of the rest.
 
-    Where it cannot, neither can all of it; where it can, the rest mostly can, as farther on the vehicle may fly slower.
-    Where one search only just succeeds, now and then the other does not: of 6,245 paths that began in motion this was
-    right about 6,240, in half the time that plan_early() takes to fail, and a fifth of that to succeed.
+    If it cannot, the task has no plan; if it can, there mostly is a plan, as the vehicle may fly slower farther on.
+    In marginal cases one of the two searches may fail alone: of 6,245 paths that began in motion the answer was right
+    for 6,240, in half the time that plan_early() takes to fail, and a fifth of the time that it takes to succeed.
     """
     if task.refusal:
         return False
@@ -97,8 +97,8 @@ def can_begin(task: PlanningTask) -> bool:
 def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = TUNING.early_window) -> Solution:
     """Refine a near-feasible profile on its grid to within about 0.02 % of the fastest.
 
-    Yaw is that of the profile, not of the task; where the task leaves it free it is optimised too. A profile may come
-    with a reason, which then says from where on it stayed as given.
+    Yaw is that of the profile, not of the task; if the task leaves it free it is optimised too. If the solution has a
+    reason besides a profile, the reason says from where on the profile was left as given.
     """
     *_, last = refinements(task, profile, window=window)
     return last
@@ -109,8 +109,8 @@ def refinements(
 ) -> Iterator[Solution]:
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
-    The first mostly passes the certificate. A path longer than `window` is planned window by window; its profile comes
-    once, after all rounds. A failure comes alone. At the task's deadline what is not refined yet stays as given.
+    The first mostly passes the certificate. A path longer than `window` is planned window by window and yields one
+    profile, after all rounds. A failure is the only item. After the task's deadline the rest stays as given.
     """
     began, nodes = time.perf_counter(), len(profile.s) - 1
     whole, near = _given(task, profile)
@@ -131,7 +131,7 @@ def refinements(
 
 
 def segment_of(task: PlanningTask, nodes: int) -> Segment:
-    """Return the first intervals of a task, `nodes` of them; the end of fewer than all of them is free."""
+    """Return the first `nodes` intervals of a task; their end is free unless they are all of it."""
     whole, step = nodes == task.nodes, task.path.end / task.nodes
     path = task.path if whole else task.path.part(0.0, nodes * step)
     yaw = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle, task.start, task.end)
@@ -145,27 +145,27 @@ def segment_of(task: PlanningTask, nodes: int) -> Segment:
 
 
 class Start(NamedTuple):
-    """One search, and where it starts."""
+    """How a search starts."""
 
     search: Search
-    lowered: float = 0.0  # fraction of h by which it starts below the coefficients that it is given
-    goes_on: bool = False  # with the multipliers that are known
+    lowered: float = 0.0  # fraction by which it lowers h of the given coefficients
+    goes_on: bool = False  # whether it takes the known multipliers
 
 
 class Strategy(NamedTuple):
-    """How a problem is searched: as the first of its starts that succeeds."""
+    """A strategy of search: its starts are tried until one succeeds."""
 
     starts: tuple[Start, ...]
-    restarts: tuple[Start, ...]  # from its solution, once limits are lowered
+    restarts: tuple[Start, ...]  # from a solution, after limits were lowered
 
 
-# From a guess; what the first does not solve starts far inside the bounds, and at last slower.
+# From a guess; if the first start fails, the next begins far inside the bounds, and the last slower.
 FROM_GUESS = (
     Start(Search(iterations=60)),
     Start(Search(barrier=0.1, push=0.3, iterations=100)),
     Start(Search(barrier=0.1, push=0.3, iterations=100), lowered=0.5),
 )
-# From the solution of a problem almost the same: with its multipliers; near the bounds, and further off.
+# From the solution of a nearly identical problem: with its multipliers; near the bounds, and farther off.
 FROM_NEARBY = (
     Start(Search(barrier=3e-3, iterations=12), goes_on=True),
     Start(Search(barrier=3e-3, push=1e-4, iterations=20)),
@@ -176,7 +176,7 @@ OPTIMUM = Strategy(FROM_GUESS, FROM_NEARBY)
 
 
 def early(interval: float) -> Strategy:
-    """Return the strategy that stops and gives up early, where an interval takes about that long, s."""
+    """Return the strategy that stops and gives up early, for intervals that take about `interval`, s."""
     t = TUNING
     start = Start(Search(
         last_barrier=t.stop_barrier * interval, push=0.1, iterations=60,
@@ -187,7 +187,7 @@ def early(interval: float) -> Strategy:
 
 
 def refining(interval: float, *, capped: bool = False) -> Strategy:
-    """Return the strategy for a near-feasible profile, under speed caps or not, whose intervals take so long, s."""
+    """Return the strategy for a near-feasible profile whose intervals take `interval`, s; `capped` by speed caps."""
     t = TUNING
     stop, fallback = t.stop_barrier * interval, t.fallback_barrier_factor * t.stop_barrier * interval
     restart = _stopping_early(fallback if capped else stop, push=3e-3, iterations=20)
@@ -207,7 +207,7 @@ def _stopping_early(
 
 
 class Attempt(NamedTuple):
-    """A solution of a problem as the solver left it."""
+    """The solver's solution of a problem."""
 
     coefficients: NDArray  # (N+3, 1 or 2)
     rows: NDArray  # (ROWS, P) at points
@@ -221,9 +221,9 @@ def solve(
     problem: Problem, coefficients: NDArray, starts: Sequence[Start], deadline: Deadline = NEVER,
     known: Multipliers | None = None,
 ) -> Attempt:  # fmt: skip
-    """Search from these coefficients, (N+3, 1 or 2), as the first of `starts` that succeeds, until the deadline.
+    """Search from these coefficients, (N+3, 1 or 2), trying `starts` until one succeeds or the deadline passes.
 
-    Starts that go on take the multipliers that are `known` of a problem almost the same.
+    Starts that go on take the multipliers `known` from a nearly identical problem.
     """
     program, iterations = SplineProgram(problem), 0
     for start in starts:
@@ -241,12 +241,12 @@ def solve(
 
 
 def rejection_reason(attempt: Attempt, segment: Segment) -> str:
-    """Return why a solution must be rejected even if the solver reports success; empty where it need not be."""
+    """Return why a solution must be rejected even if the solver reports success; empty if it is acceptable."""
     if not attempt.solved:
         return attempt.message
     if not np.isfinite(attempt.coefficients).all():
         return "the solution is not finite"
-    if (attempt.coefficients[:, 0] > 0.0).all():  # then so is h, which lies between its coefficients
+    if (attempt.coefficients[:, 0] > 0.0).all():  # then h is positive too: it lies between its coefficients
         return ""
     profile = segment.profile(attempt.coefficients)
     places = np.linspace(0.0, 1.0, 9)
@@ -260,10 +260,10 @@ def rejection_reason(attempt: Attempt, segment: Segment) -> str:
 def _tighten(
     attempt: Attempt, problem: Problem, segment: Segment, restarts: Sequence[Start], deadline: Deadline, enough: float
 ) -> Iterator[Tightened]:
-    """Lower limits and solve again until none is exceeded between points; yield what each round leads to.
+    """Lower limits and solve again until none is exceeded between points; yield the result of each round.
 
-    Where nothing is exceeded at first, but for `enough`, a fraction of a limit, or the deadline has passed by then, the
-    attempt itself comes alone. A round that fails is the last: slowing will do the rest.
+    If nothing is exceeded at first by more than `enough`, a fraction of a limit, or the deadline has passed, yield only
+    the attempt itself. A round that fails is the last: slowing the plan does the rest.
     """
     nodes = segment.layout.shape.nodes
     dense = DensePath(segment.path, nodes, held_by(segment.ends, nodes), segment.caps)
@@ -288,7 +288,7 @@ def _last(rounds: Iterator[Tightened]) -> Tightened:
 
 
 def _plan(task: PlanningTask, window: WindowSize, strategy_for: Callable[[float], Strategy], enough: float) -> Solution:
-    """Plan a task from a guess, by the strategy for intervals that take so long, s."""
+    """Plan a task from a guess; `strategy_for` gives the strategy by the duration of an interval, s."""
     task.check_nodes()
     if task.refusal:
         return task.refusal
@@ -327,7 +327,7 @@ def _given(task: PlanningTask, profile: SpeedProfile) -> tuple[Segment, NDArray]
 
 
 class _HeldAtPoints(NamedTuple):
-    """A solution that keeps its limits at points, and what it takes to go on from there."""
+    """A solution that keeps its limits at points, and the inputs for tightening it."""
 
     attempt: Attempt
     problem: Problem
@@ -335,20 +335,20 @@ class _HeldAtPoints(NamedTuple):
 
 
 def _hold_at_points(task: PlanningTask, segment: Segment, near: NDArray) -> _HeldAtPoints | str:
-    """Refine the coefficients `near` until limits are kept at points, or return why that failed."""
+    """Refine the coefficients `near` until limits are kept at points, or return the reason for failure."""
     step, capped = segment.path.end / segment.layout.shape.nodes, segment.caps is not None
     strategy = refining(interval_of(segment, near), capped=capped)
     begin = lowered(near, TUNING.initial_h_reduction, segment.ends.held, segment.unit**0.5 / step)
     problem = build_problem(segment, task.yaw_angle, coefficients=begin)
     attempt = _search_near(problem, strategy, capped, task.deadline)
-    if rejection_reason(attempt, segment) and not task.deadline.passed:  # not near enough
+    if rejection_reason(attempt, segment) and not task.deadline.passed:  # too far from feasible
         problem = build_problem(segment, task.yaw_angle)
         attempt = solve(problem, problem.coefficients, FROM_GUESS, task.deadline)
     return rejection_reason(attempt, segment) or _HeldAtPoints(attempt, problem, strategy)
 
 
 def _search_near(problem: Problem, strategy: Strategy, capped: bool, deadline: Deadline) -> Attempt:
-    """Search as the first of the strategy's starts that succeeds, and on from there if that stops far off."""
+    """Try the strategy's starts until one succeeds; search on from there if it stopped far from the optimum."""
     first, *others = strategy.starts
     attempt = solve(problem, problem.coefficients, (first,), deadline)
     steps = attempt.iterations
@@ -375,7 +375,7 @@ def _tighten_refined(task: PlanningTask, segment: Segment, found: _HeldAtPoints)
 
 
 def _solution(task: PlanningTask, whole: Segment, joined: Joined | str, began: float) -> Solution:
-    """Return the solution that windows were joined to; the search began at this time.perf_counter()."""
+    """Return the solution made of joined windows; the search began at `began`, by time.perf_counter()."""
     if isinstance(joined, str):
         return Solution(Status.OUT_OF_TIME if task.deadline.passed else Status.NOT_CONVERGED, None, joined)
     stats: dict[str, float | int | str] = {

@@ -1,4 +1,4 @@
-"""Where the search for a speed profile starts: slow enough everywhere, smooth, and led into boundary states."""
+"""Initial guesses of speed profiles: slow enough everywhere, smooth, and blended into boundary states."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ def guess(
 ) -> NDArray:
     """Return (N+3, 1 or 2) spline coefficients: of h over its `unit`, and of yaw.
 
-    `yaw` is None where it is not to be guessed, else where it starts if no state says so.
+    `yaw` is the initial yaw if no state gives one; None: no yaw is guessed.
     """
     step = path.end / nodes
     cubic = led_into(guess_spline(path, airframe, limits, nodes) / unit, unit, step, start, end)
@@ -43,7 +43,7 @@ def guess(
 def led_into(
     coefficients: NDArray, unit: float, step: float, start: BoundaryState | None, end: BoundaryState | None
 ) -> NDArray:
-    """Change (N+3,) coefficients of h over its `unit` to have the boundary states, and to leave them smoothly.
+    """Change (N+3,) coefficients of h over its `unit` so that they meet the boundary states and leave them smoothly.
 
     The given coefficients must be positive; `step` is the length of an interval in s.
     """
@@ -55,13 +55,13 @@ def led_into(
             if min(first) > 0:
                 here[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(there[1:3]), len(led) - 1, bool(start and end)))
             held.append((here, first))
-    for here, first in held:  # both have left their mark before either is put in place
+    for here, first in held:  # both are blended in before either is fixed
         here[:3] = first
     return led
 
 
 def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:
-    """Return (count,): from two offsets smoothly to zero, to the last bit at the other end if that is held too."""
+    """Return (count,): from two offsets smoothly to zero, exactly zero at the other end if that is held too."""
     x = np.arange(count) - 1.0
     last, slope = offsets[1], offsets[1] - offsets[0]
     left = np.clip(1.0 - x / (count - 2 - 2 * held), 0.0, 1.0)
@@ -69,7 +69,7 @@ def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:
 
 
 def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nodes: int, step: float) -> NDArray:
-    """Return (N+2,) coefficients: turning ever less from a state, across to what leads into the other."""
+    """Return (N+2,) coefficients of yaw: decaying turns out of one state and into the other, blended in between."""
 
     def turned(state: BoundaryState, distance: NDArray, towards: float) -> NDArray:
         faded = _G.yaw_blend * np.sign(distance) * (1.0 - np.exp(-np.abs(distance) / _G.yaw_blend))
@@ -87,7 +87,7 @@ def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nod
 
 
 def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool], rate: float) -> NDArray:
-    """Return the coefficients with h less by that share; less so next to an end that is held by a boundary state.
+    """Return the coefficients with h lowered by a fraction `share`, less so next to an end held by a boundary state.
 
     `rate` is how many intervals a second pass where x is 1.
     """
@@ -106,7 +106,7 @@ def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool], rate: 
 
 
 def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int) -> NDArray:
-    """Return (N+3,) coefficients of a cubic B-spline on the grid: h where it is taken to change slowly.
+    """Return (N+3,) coefficients of a cubic B-spline on the grid: h under the assumption that it changes slowly.
 
     With h' = 0 each limit alone gives a bound on h: |v|² = h|γ'|², |a| = h|γ''|, and with the thrust axis about
     vertical |ω| = h^1.5 |γ'''|/g and |α| = h²|γ''''|/g.
@@ -128,9 +128,9 @@ def guess_spline(path: Path, airframe: Airframe, limits: PlanLimits, nodes: int)
 
 @njit
 def _smoothed_below(values: NDArray, weights: NDArray) -> NDArray:
-    """Return the weighted mean of the least of neighbours; the first and last count as if they went on.
+    """Return the weighted mean of the minimum over neighbours; beyond the ends, the first and last value continue.
 
-    In scipy.ndimage's order, to the last bit as that, which is slow to import.
+    Equal to scipy.ndimage's result to the last bit; that is slow to import.
     """
     last, near, reach = len(values) - 1, int(_G.smoothing), len(weights) // 2
     least = np.empty(len(values))

@@ -1,4 +1,4 @@
-"""Limits exceeded between the points where the optimiser holds them: by how much, in which interval."""
+"""Find limits that are exceeded between the points at which the optimiser holds them, by interval."""
 
 import math
 from dataclasses import dataclass
@@ -27,9 +27,9 @@ CONTINUOUS = np.flatnonzero(~quantities.JUMPS)
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """By how much each row leaves its limits less the allowance, in each interval, in the rows' own units.
+    """The excess of each row over its limits, lowered by the allowance, in each interval and in the rows' own units.
 
-    Negative where it does not.
+    Negative if the row keeps them.
     """
 
     upper: NDArray  # (N, MEASURES) above quantities.UPPER
@@ -37,7 +37,7 @@ class Violation:
 
     @property
     def worst(self) -> float:
-        """Return the largest."""
+        """Return the largest excess."""
         return float(max(self.upper.max(), self.lower.max()))
 
 
@@ -45,7 +45,7 @@ class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
     def __init__(self, path: Path, nodes: int, held: NDArray, caps: SpeedCaps | None = None) -> None:
-        """Take `held`, (N,): how far, 0 to 1, a boundary state decides each interval; its violation counts less."""
+        """Take `held`, (N,): how far, 0 to 1, boundary states decide each interval, whose violation counts less."""
         self.held = held
         step = path.end / nodes
         refined = turns(path, nodes) > TUNING.sharp
@@ -57,7 +57,7 @@ class DensePath:
         self.caps = None if caps is None else caps.at(s)
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
-        """Return the violation by a profile with as many intervals; h must be positive."""
+        """Return the violation by a profile with the same number of intervals; h must be positive."""
         count = len(self.allowance)
         rows = scaled(_extremes(self.measures(profile, airframe, limits), self.begins), limits)
         return Violation(*_beyond(
@@ -130,7 +130,7 @@ def _beyond(
 def violates_at_nodes(
     path: Path, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits, caps: SpeedCaps | None = None
 ) -> bool:
-    """Return whether a limit is exceeded at a node; where none is, the certificate still decides."""
+    """Return whether a limit is exceeded at a node; if none is, the certificate still decides."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
     at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
     _count_against_caps(at, None if caps is None else caps.at(first), limits)
@@ -145,7 +145,7 @@ def _count_against_caps(measured: NDArray, caps: NDArray | None, limits: PlanLim
 
 
 def turns(path: Path, nodes: int) -> NDArray:
-    """Return (N,) rad: by how much the direction of the path differs from one end of each interval to the other."""
+    """Return the angle between the path's directions at the ends of each interval, (N,) rad."""
     s = np.arange(nodes + 1) * (path.end / nodes)
     s[0], s[-1] = s[1], s[-2]  # at rest there is no direction
     return np.asarray(_angles(path(s, 1)))
@@ -165,7 +165,7 @@ def _angles(vectors: NDArray) -> NDArray:
 
 @njit
 def spread(violation: NDArray, continuous: NDArray) -> NDArray:
-    """Return (N, MEASURES): what is `continuous` counts for neighbours too, whose points lie as near to its peak."""
+    """Return (N, MEASURES): extend `continuous` rows to neighbours too, whose points may be as near to the peak."""
     wider, last = violation.copy(), len(violation) - 1
     for row in continuous:
         for n in range(len(violation)):

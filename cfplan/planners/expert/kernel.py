@@ -1,10 +1,10 @@
-"""Constraints and penalty of points by the spline coefficients of their intervals, with derivatives, compiled.
+"""Compiled constraints and penalty at points, as functions of spline coefficients, with derivatives.
 
-In an interval h is made of four coefficients of a cubic B-spline and yaw of three of a quadratic one, so everything
-physical at a point follows from at most seven numbers. CasADi differentiates those expressions (derivatives.py), and
-numba compiles what they come to (vector_code.py); both are imported only where something is compiled.
+In an interval h depends on four coefficients of a cubic B-spline and yaw on three of a quadratic one, so every physical
+quantity at a point follows from at most seven numbers. CasADi differentiates those expressions (derivatives.py), and
+numba compiles the result (vector_code.py); both are imported only when something is compiled.
 
-Arrays hold a quantity a row and a point a column; columns are a multiple of LANES.
+Arrays hold one quantity per row and one point per column; the number of columns is a multiple of LANES.
 """
 
 from typing import Any
@@ -65,15 +65,15 @@ class Kernels:
     def __init__(self, free_yaw: bool, data: NDArray, common: NDArray, weights: NDArray, spare: int) -> None:
         """Take `data`, (POINT_DATA, P), `common`, (COMMON_DATA,), and `weights`, (3,) those of the penalties.
 
-        Arrays of constraints have `spare` more behind the rows of the points, of which the kernels know nothing.
+        Arrays of constraints have `spare` more entries behind the rows of the points, which the kernels leave alone.
         """
         k, self._points, self._spare = variables(free_yaw), data.shape[1], spare
         self._values = _free_values if free_yaw else _given_values
         self._derivatives = _free_derivatives if free_yaw else _given_derivatives
         self.coefficients = np.empty((k, self._points))
-        """(k, P) of the points' intervals, from which both calls compute: to be filled in before."""
+        """(k, P) of the points' intervals, the inputs of both calls: fill them in first."""
         self.work = np.empty((len(TERMS) * k + k * (k + 1) // 2, self._points))
-        """What differentiate() fills in.
+        """The output of differentiate().
 
         It begins with gradients, k rows each: that of the penalty, and of rows · each of the terms but the first.
         Behind them lies the Hessian of penalty + multipliers · rows, plus J'ΣJ: its lower triangle, column by column.

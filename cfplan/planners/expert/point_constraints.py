@@ -1,7 +1,7 @@
 """Point constraints: the rows that must hold at one point of a path, and the data that they depend on.
 
-Rows are those of the table of limited quantities (safety/quantities.py) but for the speed, which h alone decides. Path,
-airframe and limits are data, so that the same compiled functions (kernel.py) serve every problem.
+Rows are those of the table of limited quantities (safety/quantities.py) except the speed, which depends on h alone.
+Path, airframe and limits are data, so that the same compiled functions (kernel.py) serve every problem.
 """
 
 import numpy as np
@@ -18,8 +18,8 @@ LOWER, UPPER, JUMPS = quantities.LOWER[:ROWS], quantities.UPPER[:ROWS], quantiti
 POINT_DATA = 17  # γ' to γ'''' (12), place in the interval 0 to 1, weight of the penalties, ψ, ψ', ψ''
 COMMON_DATA = 11 + 2 * measures.MEASURES  # the airframe (10), scale; offset and scale of each row of the table
 PLACE, WEIGHT, YAW = 12, 13, 14  # rows of the point data
-LANES = 8  # points come in multiples of this, which the kernels may take with one instruction
-LEAST = 1e-6  # x below this counts as this: a solver that tries h < 0 must not meet what is not a number
+LANES = 8  # points come in multiples of this, so that kernels can process several with one instruction
+LEAST = 1e-6  # lower bound of x in the constraints: a solver that tries h < 0 must not meet NaN
 UNBOUNDED = 1e8  # stands for no limit, in a row's own unit
 
 
@@ -34,5 +34,5 @@ def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray
 
 
 def variables(free_yaw: bool) -> int:
-    """Return how many numbers decide a point, and how many spline coefficients those."""
+    """Return how many numbers determine a point, and how many spline coefficients determine those."""
     return 7 if free_yaw else 4

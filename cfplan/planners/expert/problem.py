@@ -1,4 +1,4 @@
-"""A speed-profile problem: a stretch of path, the points at which its limits hold, and how these are lowered.
+"""A speed-profile problem: a segment of path, the points at which its limits hold, and how these are lowered.
 
 Its variables are coefficients of splines on the grid: a cubic one of x = h/unit and, where yaw is free, a quadratic one
 of yaw (transcription.py). Numbers are in node units: s counted in intervals of the grid.
@@ -31,11 +31,11 @@ REST = 1e-9  # |γ'| below which a path stands still
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """What a problem's structure depends on."""
+    """The parameters of a problem's structure."""
 
     nodes: int
     free_yaw: bool
-    turning_limited: bool = False  # whether angular acceleration has a limit of its own
+    turning_limited: bool = False  # whether angular acceleration is limited
     end_intervals: tuple[int, int] = (3, 3)  # intervals at each end with more points inside
     end_places: tuple[float, ...] = (0.2, 0.5, 0.8)
     middle_places: tuple[float, ...] = (0.5,)  # points inside every other interval
@@ -44,9 +44,9 @@ class Shape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Where the points lie: the first of all intervals, then the second of all, and so on.
+    """The places of the points: the first point of all intervals, then the second of all, and so on.
 
-    The last one is repeated, without limits, until they fill the kernels' lanes.
+    The last point is repeated, without limits, to fill the kernels' lanes.
     """
 
     shape: Shape
@@ -85,11 +85,11 @@ def layout_of(shape: Shape) -> Layout:
     interval, place = np.concatenate(intervals), np.concatenate(places)
     count, padding = len(interval), -len(interval) % point_constraints.LANES
     interval, place = (np.append(each, np.repeat(each[-1:], padding)) for each in (interval, place))
-    # At an interval's right end the rest holds as it does at the next one's left end.
+    # At an interval's right end the other rows equal those at the left end of the next one.
     inner_right = (place == 1.0) & (interval < shape.nodes - 1)
     bounded = np.where(inner_right, jumping[:, None], all_rows[:, None])
     bounded[:, count:] = False
-    weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once an interval
+    weight = np.where(place == 0.0, 1.0, 0.0)  # penalties count once per interval
     weight[count:] = 0.0
     node = np.arange(shape.nodes + 1)
     speed_interval = np.concatenate([np.minimum(node, shape.nodes - 1), np.tile(node[:-1], len(shape.speed_places))])
@@ -103,7 +103,7 @@ class Ends:
 
     start: BoundaryState | None
     end: BoundaryState | None
-    continues: bool = False  # whether the start is a joint, crossed by another problem's solution with room to spare
+    continues: bool = False  # whether the start is a joint, which another problem's solution crossed with room to spare
     joint: int | None = None  # the interval before which this problem's solution will be cut, for another to go on
 
     @property
@@ -113,13 +113,13 @@ class Ends:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """What is planned at once: a path, or a window of one."""
+    """A unit of planning: a path, or a window of one."""
 
     path: Path
     airframe: Airframe
     limits: PlanLimits
     ends: Ends
-    yaw: YawSpline  # given before the speed; where yaw is free, of no account
+    yaw: YawSpline  # fixed before the speed; unused if yaw is free
     layout: Layout
     caps: SpeedCaps | None = None
     slowness: float = 1.0  # the speed limit over the speed where x is 1; see slowness_of()
@@ -140,10 +140,10 @@ class Segment:
 def slowness_of(h: NDArray, limits: PlanLimits) -> float:
     """Return the speed limit over `speed_cap_ratio` times the typical speed of some h, (K,); at least 1.
 
-    Where other limits keep a flight far below the speed limit, h counted in its squares would be next to its `floor`,
-    and the search would end before it began.
+    If other limits keep a flight far below the speed limit, h in squares of that limit would be next to its `floor`,
+    and the search would stop at once.
     """
-    middle = np.sort(h)[(len(h) - 1) // 2 : len(h) // 2 + 1]  # one or two: np.median() takes ten times as long
+    middle = np.sort(h)[(len(h) - 1) // 2 : len(h) // 2 + 1]  # one or two values: np.median() takes ten times as long
     return max(1.0, limits.speed / (TUNING.speed_cap_ratio * (float(middle[0] + middle[-1]) / 2.0) ** 0.5))
 
 
@@ -173,7 +173,7 @@ def build_problem(
 ) -> Problem:
     """Return the problem of a segment. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more.
 
-    `coefficients`, (N+3, 1 or 2), is from where to search, else a guess; they must agree with the boundary states.
+    `coefficients`, (N+3, 1 or 2), is where the search begins (None: a guess); they must agree with the boundary states.
     """
     layout, path, limits, ends = segment.layout, segment.path, segment.limits, segment.ends
     nodes = layout.shape.nodes
@@ -203,7 +203,7 @@ def build_problem(
 
 
 def interval_of(segment: Segment, coefficients: NDArray) -> float:
-    """Return how long an interval takes about, s, with these coefficients, (N+3, 1 or 2)."""
+    """Return the approximate duration of an interval, s, with these coefficients, (N+3, 1 or 2)."""
     h = segment.unit * np.maximum(coefficients[:, 0], TUNING.floor)
     return segment.path.end / segment.layout.shape.nodes * float((1.0 / np.sqrt(h)).sum()) / len(h)
 
@@ -258,8 +258,8 @@ def _lowered(
 ) -> tuple[NDArray, NDArray]:  # fmt: skip
     """Return the bounds of the rows at points, tightened by `under` and `over`, (N, MEASURES), of their intervals.
 
-    That is from the most, or least, that the rows have at the points of an interval, where that exceeds a limit
-    between them by `above`, or `below`, and from the bound before elsewhere.
+    In an interval that exceeds a limit between its points by `above`, or `below`, bounds are lowered from the largest,
+    or least, value of the rows at its points; elsewhere from the previous bound.
     """
     low, high = np.full(lower.shape, -np.inf), np.full(upper.shape, np.inf)
     for row in range(len(rows)):
@@ -280,7 +280,7 @@ def _lowered(
 def held_by(ends: Ends, nodes: int) -> NDArray:
     """Return (N,): 1 next to a boundary state, 0 from TUNING.blend on.
 
-    A state may lie at a limit, and what follows is all but decided: there is no room to lower limits there.
+    A state may lie at a limit and nearly determines what follows: there is no room to lower limits there.
     """
     if not ends.start and not ends.end:
         return np.zeros(nodes)

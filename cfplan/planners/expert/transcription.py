@@ -5,8 +5,8 @@ row it is the vector v of variables, in which an interval's coefficients lie sid
 coefficients of h and two of yaw; at a rest the first four of h have one value, so that h is constant in that interval,
 and the first two of yaw.
 
-Constraints are the kernel's rows at all points, and then what is linear in the coefficients: h where the speed limit
-holds, that coefficients of h are positive, and where yaw starts.
+Constraints are the kernel's rows at all points, followed by those that are linear in the coefficients: the speed limit,
+positive coefficients of h, and the initial yaw.
 """
 
 import math
@@ -28,7 +28,7 @@ from cfplan.planners.solver.interior_point import Linearisation, Values
 from cfplan.vehicle import yaw_spline
 from cfplan.vehicle.profile_spline import weights_at
 
-OBJECTIVE_SCALE = 1000.0  # of the cost in seconds, so that multipliers are about 1
+OBJECTIVE_SCALE = 1000.0  # factor on the cost in seconds, so that multipliers are about 1
 # Gauss-Legendre places and weights on [0, 1], for the time spent in an interval.
 _PLACES = 0.5 + np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
 _WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
@@ -38,11 +38,11 @@ _FREELY = {"contract", "reassoc", "nsz"}  # freedom in the order of sums that le
 
 
 class Sparsity(NamedTuple):
-    """How v, the intervals and the points belong together, for compiled loops.
+    """The relations between v, the intervals and the points, for compiled loops.
 
-    Points, and linear rows, lie in runs: of as many intervals, one after another. (R, 3): the first point of each run,
-    its interval, and how many. So the loops pass through memory in order, several numbers at a time, which takes
-    unsigned numbers: compiled code looks at the sign of an index.
+    Points, and linear rows, lie in runs over consecutive intervals. (R, 3): the first point of each run, its interval,
+    and the length. So loops pass through memory in order and can be vectorised, if indices are unsigned: compiled code
+    checks the sign of an index.
     """
 
     runs: NDArray  # of the P points
@@ -50,7 +50,7 @@ class Sparsity(NamedTuple):
     entries: NDArray  # (2, k(k+1)/2, N) of the flattened matrix for each pair, -1 if fixed, and how often it counts
     linear: NDArray  # (4, E) weights of four of an interval's coefficients in each linear row
     linear_runs: NDArray  # of the E rows
-    of_yaw: int  # how many of the linear rows, the last ones, weigh yaw's coefficients, not those of h
+    of_yaw: int  # number of linear rows, the last ones, that weigh yaw's coefficients instead of those of h
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +61,7 @@ class Variables:
     local: NDArray  # (k, N) where an interval's coefficients lie in the flattened table
     positive: int  # how many coefficients of h have an entry of v of their own
     size: int  # of v
-    band: int  # how far apart two coefficients that meet can be
+    band: int  # largest distance between two coupled coefficients
     sparsity: Sparsity
 
 
@@ -126,10 +126,10 @@ def _runs(interval: NDArray) -> NDArray:
 
 
 class SplineProgram:
-    """f and g by v, see interior_point.NonlinearProgram; and the way from tables of coefficients to v and back."""
+    """f and g as functions of v (interior_point.NonlinearProgram), and conversions between coefficients and v."""
 
     def __init__(self, problem: Problem) -> None:
-        """Fix what a boundary state decides at its value in the problem's table."""
+        """Fix the coefficients that boundary states decide at their values in the problem's table."""
         self._variables = it = variables_of(problem.layout, problem.ends.held, problem.rests)
         self._fixed = problem.coefficients
         self._fixed_local = problem.coefficients.ravel()[it.local]
@@ -154,7 +154,7 @@ class SplineProgram:
         return bounds_of(lower, upper)
 
     def v_of(self, coefficients: NDArray) -> NDArray:
-        """Return the variables of a table; the smallest counts where several have one value."""
+        """Return the variables of a table; the smallest counts if several share one value."""
         slots = self._variables.slots
         v = np.full(self._variables.size, np.inf)
         np.minimum.at(v, slots[slots >= 0], coefficients[slots >= 0])
@@ -185,7 +185,7 @@ class SplineProgram:
         return Linearisation(gradients, matrix, partial(_jvp, jacobian, it.sparsity))
 
     def _go_to(self, v: NDArray) -> None:
-        """Give the kernels the coefficients at v."""
+        """Pass the coefficients at v to the kernels."""
         it = self._variables.sparsity
         _gather(v, it.slots, it.runs, self._fixed_local, self._local, self._kernels.coefficients)
 
@@ -200,7 +200,7 @@ def _spread(v, slots, fixed, local):
 
 @register_jitable(fastmath=_FREELY)
 def _weigh(sparsity, local, result):
-    """Fill in what is linear in the coefficients, (k, N), of each interval."""
+    """Fill in the constraints that are linear in the coefficients, (k, N), of each interval."""
     linear, of_h = sparsity.linear, len(result) - sparsity.of_yaw
     runs = sparsity.linear_runs
     for r in range(len(runs)):

@@ -1,7 +1,7 @@
-"""The numbers of the expert that were tuned by measurement: `python -m studies planners` shows what they give.
+"""Parameters of the expert, tuned by measurement: `python -m studies planners` shows their effect.
 
-Its results are results/planners-random.json, planners-hard.json, planners-lengths.json and planners-drawn.json:
-flight times, how many are solved and seconds, by kind of path. Lengths are in intervals where nothing else is said.
+Its results are results/planners-random.json, planners-hard.json, planners-lengths.json and planners-drawn.json: flight
+times, rates of success and planning times, by kind of path. Lengths are in intervals unless stated otherwise.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ class WindowSize(NamedTuple):
 
 
 class Penalties(NamedTuple):
-    """What a second of flight costs beyond its time; keeps solutions smooth and yaw from drifting."""
+    """Penalties per second of flight, which keep solutions smooth and yaw from drifting."""
 
     angular_acceleration: float = 1e-6  # s⁴/rad², per squared angular acceleration
     yaw_rate: float = 1e-2  # s²/rad², per squared yaw rate; free yaw only
@@ -23,7 +23,7 @@ class Penalties(NamedTuple):
 
 
 class Guess(NamedTuple):
-    """Where a search from a guess begins, initial_guess.py."""
+    """Parameters of the initial guess, initial_guess.py."""
 
     highest: float = 6.0  # h at most, where the path nearly stands still, in squares of the speed limit
     usage: float = 0.7  # of each limit
@@ -42,8 +42,8 @@ class Tuning(NamedTuple):
     guess: Guess = Guess()
 
     # Limits at points, problem.py
-    margin: float = 1e-3  # fraction by which limits are tightened, for what happens between points
-    blend: int = 5  # over which that margin grows from nothing, next to a boundary state that may lie at a limit
+    margin: float = 1e-3  # fraction by which limits are tightened, for excesses between points
+    blend: int = 5  # over which that margin grows from zero, next to a boundary state, which may lie at a limit
     joint_margin: float = 0.01  # likewise around a joint, so that the next window has room
     around_joint: int = 6  # over how many on each side
     boundary_tolerance: float = 0.1  # by which rows that a checked boundary state alone decides may exceed limits
@@ -57,7 +57,7 @@ class Tuning(NamedTuple):
     allowance: float = 1.5e-3  # of the rows, kept free: certificates allow for their own sampling
     thrust_allowance: float = 4e-3  # likewise, of thrusts, which change fastest
     fine_allowance: float = 5e-3  # likewise in refined intervals
-    enough: float = 5e-4  # violation of the allowance that ends tightening, unless limits leave room
+    enough: float = 5e-4  # violation of the allowance at which tightening ends, unless limits leave room
     places: int = 17  # in an interval
     fine_places: int = 65  # in refined intervals: at the ends, where the thrust axis may swing, and in sharp turns
     refined_at_ends: int = 4

@@ -1,6 +1,6 @@
 """Generate numba code from a CasADi function that evaluates it at several points with each instruction.
 
-Imported only where numba compiles.
+Imported only when numba compiles.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -27,8 +27,8 @@ def generator(f: casadi.Function, uniform: Collection[int], width: int) -> _Oper
     """Return a numba intrinsic's code generator, for arguments (..., first, points, inputs, results).
 
     It evaluates f at `width` points from the `first` on. `inputs` and `results` are tuples of arrays, one of each of
-    the function's, with a quantity a row and a point a column; inputs numbered in `uniform` have one column.
-    The generator raises NotImplementedError at an instruction that is not known here.
+    the function's, with one quantity per row and one point per column; inputs numbered in `uniform` have one column.
+    The generator raises NotImplementedError at an unknown instruction.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Sequence[Any]) -> Any:
@@ -62,7 +62,7 @@ def generator(f: casadi.Function, uniform: Collection[int], width: int) -> _Oper
 
 
 def _align_stack(builder: Any) -> None:
-    """Let no vector on the stack lie across two lines of the processor's cache, which takes a quarter more time."""
+    """Align vectors on the stack with lines of the processor's cache; otherwise they take a quarter more time."""
     builder.function.attributes.add("noinline")
     builder.function.attributes.alignstack = 64
 
@@ -71,7 +71,7 @@ def _evaluate(
     builder: Any, vector: Any, f: casadi.Function, load: Callable[[int, int], _Value],
     store: Callable[[int, int, _Value], None],
 ) -> None:  # fmt: skip
-    """Go through the instructions of CasADi's virtual machine; each writes to one of its registers."""
+    """Translate the instructions of CasADi's virtual machine; each writes to one of its registers."""
     operations = _operations(builder, vector)
     registers: dict[int, _Value] = {}
     for k in range(f.n_instructions()):

@@ -1,7 +1,7 @@
-"""A long path planned window by window, so that time grows with its length and memory does not.
+"""Plan a long path window by window, so that time grows with its length and memory does not.
 
-Each window begins in the state where the kept part of the one before ends, and looks further than it keeps, by more
-than it takes to brake. Joints are crossed a little below the limits.
+Each window begins in the state at the end of the previous window's kept part, and looks ahead beyond its own kept part
+by more than the braking distance. Joints are crossed a little below the limits.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from cfplan.vehicle.yaw_spline import YawSpline
 
 
 class Tightened(NamedTuple):
-    """A window's solution, which keeps its limits between the points too, as far as lowering them led."""
+    """A window's solution after tightening, which mostly keeps its limits between the points too."""
 
     coefficients: NDArray  # (N+3, 1 or 2)
     rounds: int  # of tightening
@@ -34,7 +34,7 @@ class Joined(NamedTuple):
     joints: tuple[float, ...]  # s, where windows meet
     iterations: int
     rounds: int  # of tightening
-    unfinished: str = ""  # why the windows from some place on are as they were given; empty where all are solved
+    unfinished: str = ""  # why the windows from some place on were left as given; empty if all are solved
 
 
 def windows_of(path: Path, nodes: int, size: WindowSize, limits: PlanLimits) -> list[tuple[int, int, int]]:
@@ -63,10 +63,10 @@ def by_windows(
     search: Callable[[Segment, NDArray], Tightened | str],
     near: NDArray | None = None,
 ) -> Joined | str:
-    """Solve the whole by windows of that size, and join them; or return why not.
+    """Solve the whole segment by windows of that size, and join them; or return the reason for failure.
 
-    `search` solves one window; it is given the coefficients that `near`, (N+3, 1 or 2), has there, else zeros, but for
-    those that a joint decides. Where a window fails behind one that does not, that one and all behind it stay `near`.
+    `search` solves one window from the coefficients of `near`, (N+3, 1 or 2), in that window, or from zeros without it;
+    those that a joint decides are set. If a window fails behind a solved one, it and all behind it stay as in `near`.
     """
     shape, ends = whole.layout.shape, whole.ends
     nodes, step = shape.nodes, whole.path.end / shape.nodes
@@ -101,7 +101,7 @@ def by_windows(
 
 
 def _lead_back(found: NDArray, given: NDArray) -> None:
-    """Lead what a window found beyond what it keeps back to what was given there, so that the next begins smoothly."""
+    """Blend a window's solution beyond its kept part into the given one, so that the next window begins smoothly."""
     share = np.clip(np.linspace(-1.0, 1.0, len(found)), 0.0, 1.0)
     share = share**2 * (3.0 - 2.0 * share)
     found[:, 0] = found[:, 0] ** (1.0 - share) * given[:, 0] ** share

@@ -1,4 +1,4 @@
-"""The cost of a path while it is chosen: its flight time, and what leaving the room costs; with the gradient.
+"""The cost by which a path is chosen: its flight time plus a penalty on leaving the room, with the gradient.
 
 The multipliers of the expert's problem say how the flight time changes with the path (expert/sensitivity.py); one
 adjoint solve carries that to segment times and points (geometry/min_snap_gradient.py).
@@ -35,12 +35,12 @@ Timing = tuple[float, NDArray, NDArray]  # s; its derivatives, (5, 3, P), by γ 
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """What a path is chosen for, besides its room."""
+    """The requirements on a path besides its room."""
 
     regions: tuple[Region, ...]  # one for each waypoint
     yaw: YawMode
     yaw_angle: float  # rad
-    start: BoundaryState | None = None  # in motion; None: at rest
+    start: BoundaryState | None = None  # state in which it begins; None: at rest
 
 
 @dataclass(slots=True, eq=False)

@@ -1,8 +1,8 @@
-"""Paths on which a vehicle goes on: chosen like those from rest, in the few milliseconds that there are in flight.
+"""Choose paths that continue a motion, like those from rest but within the few milliseconds available in flight.
 
-A path begins in the state of a joint, with time as s, or at rest. Two descents choose it: one with soft limits, which
-may begin with any path (soft_limits.py), and a few steps of one along the gradient of the flight time (cost.py). What
-cannot be flown is descended again with limits that are less soft; and again from a path that brakes first.
+A path begins in the state at a joint, with time as s, or at rest. Two descents choose it: one with soft limits, which
+may begin with any path (soft_limits.py), then a few steps along the gradient of the flight time (cost.py). If the
+result cannot be flown, the first descent goes on with harder limits, and then from a path that brakes first.
 """
 
 import math
@@ -25,14 +25,14 @@ from cfplan.safety.limits import Limits
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
-WEIGHTS = (1.0, 10.0, 100.0)  # of what exceeds soft limits, one descent after another
-SOFT_STEPS, SOFT_TOLERANCE = 40, 2e-3  # of the descents with soft limits; of the cost, by which steps improve it
-STEPS, TOLERANCE = 2, 2e-3  # of those along the gradient of the flight time; four more gain 0.5 % in half as long again
-_GENTLY = 0.7  # of the limit on acceleration, at which the vehicle brakes and gains speed where a descent begins
-_SOON = 0.1  # s, the shortest segment where a descent begins
-_SAME = 1e-9  # of the end of a path, within which two of its places are one
-_INSIDE = 0.05  # m from the margin, at which points lie where a descent begins
-_OUTSIDE = 1e3  # s/m³, weight of the square of what leaves the room
+WEIGHTS = (1.0, 10.0, 100.0)  # of the excess over soft limits, in successive descents
+SOFT_STEPS, SOFT_TOLERANCE = 40, 2e-3  # of descents with soft limits; the tolerance is a fraction of the cost
+STEPS, TOLERANCE = 2, 2e-3  # of descents of the flight time; four more steps gain 0.5 % and take 50 % longer
+_GENTLY = 0.7  # fraction of the limit on acceleration that is assumed in initial paths
+_SOON = 0.1  # s, the shortest segment of an initial path
+_SAME = 1e-9  # fraction of a path's end, within which two of its places count as one
+_INSIDE = 0.05  # m inside the margin, for points of an initial path
+_OUTSIDE = 1e3  # s/m³, weight of the squared excursion from the room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,26 +41,26 @@ class Departure:
 
     position: NDArray  # (3,) m
     motion: NDArray | None = None  # (5, 3) γ to γ'''' with time as s; None at rest
-    state: BoundaryState | None = None  # likewise
+    state: BoundaryState | None = None  # None at rest
     yaw: YawMode = YawMode.FIXED
-    yaw_angle: float = 0.0  # rad, to which the vehicle turns along the path
+    yaw_angle: float = 0.0  # rad, final yaw
 
     @property
     def velocity(self) -> NDArray:
-        """Return it, (3,) m/s."""
+        """Return the velocity, (3,) m/s."""
         return np.zeros(3) if self.motion is None else self.motion[1]
 
 
 def onward_paths(starts: list[Knots], departure: Departure, limits: Limits, speed: float) -> Iterator[Knots]:
-    """Yield paths from a departure, the fastest first; `starts` are where descents may begin, those ahead first.
+    """Yield paths from a departure; the initial path in `starts` with the least cost is descended first.
 
-    `speed`, m/s, is a limit besides. What is yielded may still leave the room, or exceed a limit from the start on.
+    `speed`, m/s, is an additional limit. Paths may still leave the room, or exceed a limit from the start on.
     """
     room = Room(limits.space, starts[0].points[starts[0].waypoint], None)
     if limits.space.obstacles and not limits.link_loss.only_warn:
         room = room.to_come_down()
     course = Course((None,) * len(starts[0].waypoint), departure.yaw, departure.yaw_angle, departure.state)
-    begun = max(speed, float(np.linalg.norm(departure.velocity)))  # a path along which it brakes at once turns too fast
+    begun = max(speed, float(np.linalg.norm(departure.velocity)))  # a path made for braking at once would turn too fast
     soft = [_soft(knots, course.regions, limits, room, begun) for knots in starts]
     firsts = [np.append(0.0, each.variables.first) for each in soft]
     costs = [each(first)[0] for each, first in zip(soft, firsts, strict=True)]
@@ -83,7 +83,7 @@ def _soft(knots: Knots, regions: tuple[Region, ...], limits: Limits, room: Room,
 
 
 def _descended(knots: Knots, course: Course, limits: Limits, room: Room) -> Knots | None:
-    """Return the path after some steps along the gradient of the flight time; None where it cannot be flown."""
+    """Descend along the gradient of the flight time; return the path, or None if it cannot be flown."""
     variables = variables_of(knots, course.regions, 1, limits.space.margin)
     cost = PathCost(course, limits, room, variables, NEVER, _OUTSIDE)
     descended = descend(cost, variables.first, NEVER, tolerance=TOLERANCE, iterations=STEPS)
@@ -91,7 +91,7 @@ def _descended(knots: Knots, course: Course, limits: Limits, room: Room) -> Knot
 
 
 def toward(departure: Departure, waypoints: NDArray, limits: Limits) -> list[Knots]:
-    """Return where descents begin to paths through waypoints, (K, 3) m: straight to them, and braking first."""
+    """Return initial paths through waypoints, (K, 3) m: straight to them, and, in motion, one that brakes first."""
     points, waypoint = with_corners(np.concatenate([departure.position[None], waypoints]), limits.space)
     straight = Knots(_times(points, departure.velocity, limits), points, waypoint, departure.motion)
     straight = _clipped(with_points_between(straight), limits)
@@ -108,9 +108,9 @@ def toward(departure: Departure, waypoints: NDArray, limits: Limits) -> list[Kno
 def along(
     trajectory: Trajectory, leave: float, reached: NDArray, departure: Departure, more: NDArray, limits: Limits
 ) -> Knots:
-    """Return the knots of a path that lie ahead at `leave`, s, at the times at which they are flown.
+    """Return the knots of the previous path from `leave`, s, on, at the times at which they are flown.
 
-    `reached`, (K,), is s at the waypoints that stay; `more`, (J, 3) m, follow them. K + J is at least 1.
+    `reached`, (K,), is s at the waypoints that stay; `more`, (J, 3) m, are waypoints behind them. K + J is at least 1.
     """
     path, s = trajectory.path, float(trajectory.s_at(leave))
     free = path.breaks[(path.breaks > s) & (path.breaks < reached.max(initial=s))]
@@ -118,7 +118,7 @@ def along(
     places = np.sort(np.concatenate([[s], reached, free]))
     is_waypoint = np.isin(places, np.append(reached, s))
     times = trajectory.time_at(places)
-    # Points too near to one another would hardly shape the path between them.
+    # Points that are too close to each other hardly shape the path between them.
     apart = np.minimum(np.diff(times, prepend=-np.inf), np.diff(times, append=np.inf)) > _SOON / 2
     kept = is_waypoint | apart
     places, times, waypoint = places[kept], times[kept], np.flatnonzero(is_waypoint[kept])
@@ -142,7 +142,7 @@ def _gain(limits: Limits) -> float:
 
 
 def _times(points: NDArray, velocity: NDArray, limits: Limits) -> NDArray:
-    """Return about how long each segment takes, (M,) s, the first one longer by what turning back takes."""
+    """Return approximate segment times, (M,) s; the first includes the time to turn round."""
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     times = 2.0 * np.sqrt(lengths / limits.plan.acceleration) + 0.4 * lengths / limits.plan.speed

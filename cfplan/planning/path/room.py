@@ -50,7 +50,7 @@ class Room:
         return np.asarray(aside - (np.inf if self.corridor is None else self.corridor))
 
     def penalty(self, positions: NDArray, leg: NDArray, reserve: float) -> tuple[NDArray, NDArray]:
-        """Return the square of what each position lacks to a `reserve`, m, (P,) m², and its gradient, (P, 3) m.
+        """Return how far each clearance falls below `reserve`, m, squared, (P,) m², and the gradient, (P, 3) m.
 
         `positions` is (P, 3) m.
         """

@@ -1,8 +1,8 @@
-"""The cost of a path that is flown as it is parameterised: its time, and what exceeds limits; with the gradient.
+"""The cost of a path with time as its parameter: its duration plus penalties on exceeded limits, with the gradient.
 
-With s the time, derivatives of the path are those of the motion, and limits are bounds on their sizes. Exceeding one
-costs the square of the excess, so this cost is finite for any path and a descent may begin with one that cannot be
-flown. No speed profile is planned: it takes a fiftieth of the time that PathCost takes (after Wang et al.,
+With time as s, the derivatives of the path are those of the motion, and limits bound their norms. The penalty is the
+square of the excess, so the cost is finite for any path, and a descent may begin with one that cannot be flown. No
+speed profile is planned: evaluating this cost takes a fiftieth of the time of PathCost (after Wang et al.,
 "Geometrically constrained trajectory optimization for multicopters", 2022).
 """
 
@@ -20,31 +20,31 @@ from cfplan.planning.path.variables import TIME_UNIT, ChoiceVariables, Knots
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
 
-_PLACES = 10  # of each piece, where limits count
-# Fractions of the limits beyond which motion costs, and weights of the squares of the excess: the limits of the
-# speed profile, planned afterwards, are kept more easily along a path that is gentle.
+_PLACES = 10  # in each piece, at which limits are evaluated
+# Fractions of the limits above which the penalty begins, and weights of the squared excess. They are below 1 because
+# the speed profile, planned afterwards, keeps its limits more easily on a gentle path.
 SPEED, ACCELERATION, THRUST, SNAP = (0.98, 30.0), (0.9, 10.0), (0.95, 30.0), (0.85, 1.0)
-_FADING = 0.1  # s, weight of the square of the jump of snap at the start, as a fraction of the limit
-_ROOM = 1e3  # s/m³, weight of the square of what leaves the room
-_RESERVE = 0.02  # m, kept inside
+_FADING = 0.1  # s, weight of the squared jump of snap at the start, as a fraction of the limit
+_ROOM = 1e3  # s/m³, weight of the squared excursion from the room
+_RESERVE = 0.02  # m, distance to keep inside the room
 _TINY = 1e-9
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
-_FRACTIONS = (np.arange(_PLACES) + 0.5) / _PLACES  # of a piece, where its places lie
-_AT_PLACES = _FRACTIONS[:, None] ** np.arange(8) @ BASES[:5]  # (5, Q, 8), γ to γ'''' there by the values at its ends
+_FRACTIONS = (np.arange(_PLACES) + 0.5) / _PLACES  # of a piece: its places
+_AT_PLACES = _FRACTIONS[:, None] ** np.arange(8) @ BASES[:5]  # (5, Q, 8), γ to γ'''' there from the values at its ends
 
 
 @dataclass(slots=True, eq=False)
 class SoftLimits:
-    """The cost of variables x, (1+n,): the logarithm of the unit of time, and those of a choice."""
+    """The cost of variables x, (1+n,): the logarithm of a factor on all times, and the variables of a chosen path."""
 
     variables: ChoiceVariables
     limits: Limits
     room: Room
     speed: float  # m/s, limit
-    weight: float = 1.0  # of all that exceeds a limit
+    weight: float = 1.0  # of all excesses
 
     def knots(self, x: NDArray) -> Knots:
-        """Return times and points of the variables."""
+        """Return the times and points that the variables stand for."""
         knots = self.variables.knots(x[1:])
         return knots._replace(times=knots.times * math.exp(TIME_UNIT * x[0]))
 
@@ -53,7 +53,7 @@ class SoftLimits:
         points, times, start = knots.points, knots.times, knots.start_derivatives
         try:
             at_points = derivatives_at(points, times, start, rest_end=True)
-        except InputError:  # times so different that they make no path
+        except InputError:  # the times differ too much to make a path
             return math.inf, np.zeros_like(x)
         # γ to γ'''' at the places of each piece, which lie at fixed fractions of it, (5, M, Q, 3).
         unit = times[:, None, None] ** -np.arange(5.0)[:, None, None, None]
@@ -78,7 +78,7 @@ class SoftLimits:
         return cost, np.append(by_unit, self.variables.gradient(x[1:], scale * by_times, by_points))
 
     def _excess(self, path: NDArray) -> tuple[NDArray, NDArray]:
-        """Return the weighted squares of what exceeds limits, (M, Q), and their gradient, like `path` (5, M, Q, 3)."""
+        """Return the weighted squared excesses, (M, Q), and their gradient, in the shape of `path`, (5, M, Q, 3)."""
         plan, airframe = self.limits.plan, self.limits.airframe
         drag = airframe.drag[0] / airframe.mass
         force = path[2] + drag * path[1] + _GRAVITY

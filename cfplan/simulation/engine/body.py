@@ -1,9 +1,9 @@
-"""The rigid body with motor lag and what air does to moving rotors, stepped at 1 kHz or a little slower.
+"""The rigid body with motor lag and the aerodynamics of moving rotors, stepped at 1 kHz or a little slower.
 
-Air does three things in proportion to the velocity v through it, in body axes: drag, a moment about x and y that tilts
-the body against its motion (v_y about x, -v_x about y: blade flapping, drag above the centre of mass), and with |v|² in
-the rotor plane more thrust at the same rotor speed. Real flights show all three. Motors give the thrust that they are
-asked for times the airframe's thrust scale; where that curves, a parabola through nothing asked and hover.
+Air has three effects. In proportion to the velocity v through it, in body axes: drag, and a moment about x and y that
+tilts the body against its motion (v_y about x, -v_x about y: blade flapping, drag above the centre of mass). In
+proportion to |v|² in the rotor plane: more thrust at the same rotor speed. Real flights show all three. Motors give the
+commanded thrust times the airframe's thrust scale; a curved thrust is a parabola through zero thrust and hover.
 
 Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
 
@@ -50,7 +50,7 @@ from cfplan.vehicle.rotations import Quaternion, Vector, axes_of, product, yaw_o
 
 TIME_STEP = 0.001  # s
 
-# About what a Crazyflie's feet, 32 mm from its centre and 10 mm below it, and gravity make of a fall onto an edge.
+# Estimated from a fall onto an edge under gravity, with feet 32 mm from the centre and 10 mm below it.
 TIPPING_ANGLE = np.radians(75.0)  # rad from upright: beyond it, over onto the back
 TIPPING_RATE = 10.0  # rad/s
 _LEVEL = 1e-9  # rad
@@ -58,7 +58,7 @@ _LEVEL = 1e-9  # rad
 
 @njit(allocates=False, error_model="numpy")
 def step_body(vehicle: NDArray, step: float) -> None:
-    """Advance one vehicle, (77,) as in `layout`, by a step, s, with the thrusts that are asked for."""
+    """Advance one vehicle, (77,) as in `layout`, by a step, s, with the commanded thrusts."""
     move(vehicle, 1, 0, step)
     stay_above_floor(vehicle, 1, 0, step)
 
@@ -85,7 +85,7 @@ def move(batch: NDArray, width: int, n: int, step: float) -> None:
     air_x, air_y, air_z = _along(axes, vx - wind[0], vy - wind[1], vz - wind[2])
     lift = 1.0 + batch[LIFT * width + n] * (air_x * air_x + air_y * air_y)
 
-    # Motors: thrust follows what is asked for with a lag; a rotor that speeds up turns the body the other way round.
+    # Motors: thrust follows the command with a lag; a rotor that speeds up turns the body the other way.
     response = min(1.0, step / max(batch[LAG * width + n], 1e-9))
     push_0, twist_0 = _spin_up(batch, width, n, 0, response, lift, per_step)
     push_1, twist_1 = _spin_up(batch, width, n, 1, response, lift, per_step)

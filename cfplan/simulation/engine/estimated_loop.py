@@ -1,9 +1,9 @@
 """The closed loop with the estimator in it: body, sensors, poses, Kalman filter and controller, compiled.
 
-A dry run on the true state leaves out what the filter believes. Its gyroscope and accelerometer pass the firmware's
-low-passes (80 and 30 Hz), poses arrive late, the filter knows no drag, and the controller, Lee's or Mellinger's, flies
-on what it believes. At each millisecond: sensors, a pose if one arrives, the filter, every second time the controller,
-the body.
+A dry run on the true state leaves out the errors of the estimate. Here gyroscope and accelerometer pass the firmware's
+low-pass filters (80 and 30 Hz), poses arrive late, the filter does not model drag, and the controller, Lee's or
+Mellinger's, flies on the estimate. Each millisecond: sensors, a pose if one arrives, the filter, the controller (every
+second time), the body.
 """
 
 from dataclasses import dataclass, field
@@ -38,7 +38,7 @@ from cfplan.vehicle.rotations import matrix_of, product, yaw_of
 
 BELIEF_SIZE = 13
 POSE_LATENCY = 0.005  # s; public logs: 3 to 8 ms
-GYRO_CUTOFF, ACCELEROMETER_CUTOFF = 80.0, 30.0  # Hz, of the firmware's low-passes
+GYRO_CUTOFF, ACCELEROMETER_CUTOFF = 80.0, 30.0  # Hz, of the firmware's low-pass filters
 _SETTLING = 4000  # ms of hover in which the filter's covariance settles
 _POSE_PERIOD = 10  # ms, while it settles
 
@@ -51,7 +51,7 @@ class EstimatorInput:
     latency: float = POSE_LATENCY  # s
     attitude_latency: float | None = None  # s of its attitude, where that is another
     with_attitude: bool = True  # a single marker gives none
-    position_deviation: float = 0.001  # m, as the filter is told (locSrv.extPosStdDev)
+    position_deviation: float = 0.001  # m, as set in the firmware (locSrv.extPosStdDev)
     attitude_deviation: float = 0.05  # rad (locSrv.extQuatStdDev)
     drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s that the filter knows (kalman.dragB)
     noise: NDArray = field(default_factory=lambda: np.zeros((0, 6)))  # (M or 0, 6) m, and rad about the body's axes
@@ -59,7 +59,7 @@ class EstimatorInput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatedFlight:
-    """What a simulated vehicle did and believed, every millisecond."""
+    """The state and the estimate of a simulated vehicle, every millisecond."""
 
     states: NDArray  # (N, 17) as in `layout`
     beliefs: NDArray  # (N, 13) estimated position, velocity, quaternion; body rate as measured
@@ -68,7 +68,7 @@ class EstimatedFlight:
 
 
 class _Loop(NamedTuple):
-    """The arrays of the compiled loop; those of the flight are filled."""
+    """The arrays of the compiled loop, which fills in those of the flight."""
 
     states: NDArray
     beliefs: NDArray
@@ -221,7 +221,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
 
 @register_jitable
 def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) -> None:
-    """Ask the controller: write thrust and torques, and ask the motors."""
+    """Run the controller: write thrust and torques, and command the motors."""
     arm, twist, most, per_unit, by_mellinger = loop.levers
     asked = loop.vehicle[ASKED : ASKED + 4]
     if by_mellinger == 0.0:
@@ -231,7 +231,7 @@ def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) 
     loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoint
     units = mellinger.step_mellinger(loop.vehicle, loop.gains, loop.mode, belief, 2 * TIME_STEP)
     control[0], control[1] = 4 * per_unit * units[0], 2 * arm * per_unit * units[1]
-    control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # its signs are older
+    control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # legacy signs
     commands = mellinger.mixed(units)
     for motor in range(4):
         asked[motor] = commands[motor] * per_unit

@@ -1,6 +1,6 @@
-"""One flight of setpoints, noted each millisecond: what the vehicle does with the bytes that it is sent.
+"""Simulate one flight of setpoints, as sent in bytes, and record the vehicle each millisecond.
 
-The firmware's recorded flights were made the same way.
+The recorded flights of the firmware were made in the same way.
 """
 
 from dataclasses import dataclass, field
@@ -37,8 +37,8 @@ class EstimateErrors:
     """Errors of the controller's estimate of position and velocity; its attitude and body rate are exact."""
 
     latency: float = 0.0  # s by which position and velocity are late
-    position_noise: float = 0.0  # m, standard deviation, anew each 10 ms
-    velocity_noise: float = 0.0  # m/s, standard deviation, anew each 10 ms
+    position_noise: float = 0.0  # m, standard deviation, drawn every 10 ms
+    velocity_noise: float = 0.0  # m/s, standard deviation, drawn every 10 ms
     seed: int = 0
 
 
@@ -47,9 +47,9 @@ PERFECT = EstimateErrors()
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What a flight meets; as planned unless said."""
+    """Conditions of a flight; the defaults are those of the plan."""
 
-    gains: MellingerGains | None = None  # of the controller; the airframe's where not given
+    gains: MellingerGains | None = None  # of the controller; None: the airframe's
     floor: float = NO_FLOOR  # m
     delay: float = 0.0  # s by which setpoints are late
     estimate: EstimateErrors = PERFECT
@@ -67,7 +67,7 @@ class ClosedLoop:
 
     time: NDArray  # (N,) s
     states: NDArray  # (N, 17) as in `layout`
-    commands: NDArray  # (N, 4) what the controller asked of each motor, 16-bit units
+    commands: NDArray  # (N, 4) command of each motor, 16-bit units
 
     @property
     def position(self) -> NDArray:
@@ -130,7 +130,7 @@ def fly_setpoints(
 
 
 def _noise(estimate: EstimateErrors, steps: int) -> NDArray:
-    """Return (M, 6), M >= steps: errors of position, m, and velocity, m/s, for each millisecond; none where exact."""
+    """Return (M, 6), M >= steps: errors of position, m, and velocity, m/s, for each millisecond; none if exact."""
     if estimate.position_noise == estimate.velocity_noise == 0.0:
         return np.zeros((0, 6))
     random = np.random.default_rng(estimate.seed)

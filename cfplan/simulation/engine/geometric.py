@@ -18,7 +18,7 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import axes_of, hopf_quaternion
 from cfplan.vehicle.trajectory import FullState
 
-CONTROL_STEPS = 2  # of the body's, at which the controller is asked: 500 Hz
+CONTROL_STEPS = 2  # of the body, per step of the controller: 500 Hz
 # Of the reference: position and velocity 0:6, specific thrust with its direction 6:9, Hopf yaw, body rate, and angular
 # acceleration in body axes.
 FORCE, YAW, RATE, TURNING, REFERENCE_SIZE = 6, 9, 10, 13, 16
@@ -37,11 +37,11 @@ class GeometricFlight:
 
     time: NDArray  # (N,) s
     states: NDArray  # (N, 17) as in `layout`
-    asked: NDArray  # (N, 4) N, thrust that the controller asks of each motor, not held within their range
+    asked: NDArray  # (N, 4) N, commanded thrust of each motor, not limited to its range
 
 
 def reference_rows(state: FullState) -> NDArray:
-    """Return (N, 16): what the controller follows, of a trajectory's full state at N times."""
+    """Return the controller's reference, (N, 16), from a trajectory's full state at N times."""
     force = state.specific_thrust[:, None] * state.thrust_axis
     columns = (
         state.position, state.velocity, force, state.yaw[:, None], state.body_rate, state.angular_acceleration
@@ -52,7 +52,7 @@ def reference_rows(state: FullState) -> NDArray:
 def follow(reference: NDArray, airframe: Airframe, start: NDArray) -> GeometricFlight:
     """Follow the reference, (K, 16), each row for 2 ms, from the state `start`, (17,), without a floor.
 
-    Where the simulation diverges, states are not finite from there on.
+    If the simulation diverges, states are not finite from then on.
     """
     steps = CONTROL_STEPS * len(reference)
     states, asked = np.empty((steps + 1, STATE_SIZE)), np.zeros((steps + 1, 4))
@@ -94,7 +94,7 @@ def _follow(states: NDArray, asked: NDArray, reference: NDArray, vehicle: NDArra
 
 @njit(error_model="numpy")
 def _control(command: NDArray, wanted: NDArray, state: NDArray, believed: _Believed) -> None:
-    """Write the thrust to ask of each motor, (4,) N."""
+    """Write the commanded thrust of each motor, (4,) N."""
     inertia, thrusts, mass = believed
     force, error, rate, turning, wrench = np.empty(3), np.empty(3), np.zeros(3), np.zeros(3), np.zeros(4)
     for k in range(3):

@@ -5,7 +5,7 @@ n is at [q * width + n]. All steps of the simulation take (batch, width, n). A v
 so its array is simply its quantities in order. With a width that the compiler knows, WIDTH, it sees that rows do not
 overlap, and works on several lanes with one instruction.
 
-A snapshot, (31,), is the first rows: what goes on where a simulation branches off another.
+A snapshot, (31,), is the first rows: the part of the state that a simulation needs to branch off another.
 """
 
 from typing import Any
@@ -49,7 +49,7 @@ FULL_EFFICIENCY = np.ones(4)
 def pack_airframe(
     airframe: Airframe, *, floor: float = 0.0, wind: NDArray = STILL_AIR, efficiency: NDArray = FULL_EFFICIENCY
 ) -> NDArray:
-    """Return (26,): an airframe as a batch holds it, and what is about it.
+    """Return (26,): an airframe as a batch holds it, and its surroundings.
 
     `floor` is the height of the ground, m, -inf for none; `wind` (3,) m/s in world axes; `efficiency` (4,) the fraction
     of its thrust that each motor gives.
@@ -135,5 +135,5 @@ def write_quadruple(batch: NDArray, width: int, n: int, row: int, values: Any) -
 
 @register_jitable
 def padded(lanes: int) -> int:
-    """Return how many lanes to work on: whole vectors, unless one or two lanes are done sooner alone."""
+    """Return how many lanes to process: complete vectors, unless one or two lanes alone are faster."""
     return lanes if lanes <= 2 else min((lanes + _VECTOR - 1) // _VECTOR * _VECTOR, WIDTH)

@@ -1,6 +1,6 @@
 """The firmware's Lee controller with its integrals, as crazyflie-firmware has it (controller 5).
 
-Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (2010). It asks for a collective
+Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (2010). It commands a collective
 thrust and torques; the power distribution divides them among the motors. Runs at 500 Hz inside numba:
 
     reference (14,)  position 0:3, velocity 3:6, acceleration 6:9, jerk 9:12, yaw 12 rad, yaw rate 13 rad/s
@@ -101,7 +101,7 @@ _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @register_jitable(forceinline=True)
 def _pull(memory: NDArray, gains: NDArray, reference: NDArray, state: NDArray, axis: int, period: float) -> float:
-    """Return the acceleration, m/s², that is wanted along an axis, and add to the integral."""
+    """Return the desired acceleration along an axis, m/s², and update the integral."""
     error = reference[axis] - state[axis]
     memory[axis] += period * error
     return (
@@ -139,7 +139,7 @@ def _dot(a: Vector, b: Vector) -> float:
 
 @register_jitable
 def divide_power(control: NDArray, levers: tuple[float, float], most: float, motors: NDArray) -> None:
-    """Divide thrust and torques among the motors, (4,) N; all are lowered by what the largest exceeds `most`, N.
+    """Divide thrust and torques among the motors, (4,) N; all are lowered by the excess of the largest over `most`, N.
 
     `levers`, m: the arm about x and y, and the yaw torque per thrust.
     """

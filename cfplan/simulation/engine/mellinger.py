@@ -1,8 +1,8 @@
 """The firmware's Mellinger controller and power distribution, as crazyflie-firmware 2026.08 has them.
 
 Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors" (2011), with the firmware's
-integrators and its term on the change of body rates. Runs at 500 Hz, on one lane of a batch (see `layout`), of which it
-reads the setpoint and updates its memory:
+integrators and its term on the change of body rates. Runs at 500 Hz on one lane of a batch (see `layout`), in
+which it reads the setpoint and updates the memory:
 
     setpoint (20)   position 0:3, velocity 3:6, acceleration 6:9, quaternion 9:13 x y z w, body rate 13:16 rad/s
                     (right-handed body axes), roll, pitch, yaw 16:19 rad (the firmware's legacy signs: pitch up is
@@ -75,7 +75,7 @@ def level_out(setpoint: NDArray, mode: NDArray) -> None:
 
 @njit(allocates=False, error_model="numpy")
 def step_mellinger(vehicle: NDArray, gains: Gains, mode: Modes, belief: NDArray, period: float) -> Quadruple:
-    """Step the controller of one vehicle, (77,), on what it believes, (13,); return its control."""
+    """Step the controller of one vehicle, (77,), on an estimated state, (13,); return its control."""
     place, speed = (belief[0], belief[1], belief[2]), (belief[3], belief[4], belief[5])
     attitude, rate = (belief[6], belief[7], belief[8], belief[9]), (belief[10], belief[11], belief[12])
     return mellinger(vehicle, 1, 0, gains, mode, (place, speed, attitude, rate), period)
@@ -83,13 +83,13 @@ def step_mellinger(vehicle: NDArray, gains: Gains, mode: Modes, belief: NDArray,
 
 @njit(allocates=False, error_model="numpy")
 def fly_mellinger(vehicle: NDArray, gains: Gains, mode: Modes) -> None:
-    """Step the controller of one vehicle that knows its true state, by CONTROL_PERIOD, and ask its motors."""
+    """Step the controller of one vehicle on its true state by CONTROL_PERIOD, and command its motors."""
     ask(vehicle, 1, 0, mixed(step_mellinger(vehicle, gains, mode, vehicle[:13], CONTROL_PERIOD)))
 
 
 @register_jitable(forceinline=True)
 def ask(batch: NDArray, width: int, n: int, commands: Quadruple) -> None:
-    """Ask the motors of a lane for what commands, in 16-bit units, stand for."""
+    """Set the commanded thrusts of a lane's motors from 16-bit commands."""
     scale = batch[THRUST_MAX * width + n] / FULL_COMMAND
     thrusts = commands[0] * scale, commands[1] * scale, commands[2] * scale, commands[3] * scale
     write_quadruple(batch, width, n, ASKED, thrusts)
@@ -139,7 +139,7 @@ def mellinger(
 
 @register_jitable(forceinline=True)
 def _if(holds: bool, values: Vector) -> tuple[float, float, float]:
-    """Return values where something holds, else zeros."""
+    """Return the values if `holds`, else zeros."""
     return (values[0] if holds else 0.0), (values[1] if holds else 0.0), (values[2] if holds else 0.0)
 
 
@@ -166,7 +166,7 @@ def _wanted_yaw(
 def _pull(
     gains: Gains, upwards: bool, error: float, error_rate: float, integral: float, period: float
 ) -> tuple[float, float]:
-    """Return the force that the error of position along an axis calls for, N, and the integral of that error."""
+    """Return the force along an axis in response to the position error, N, and the integral of that error."""
     if upwards:
         kp, kd, ki, largest = gains[_KP_Z], gains[_KD_Z], gains[_KI_Z], gains[_I_RANGE_Z]
     else:

@@ -1,16 +1,16 @@
-"""The simulator: a batch of vehicles, each with its own airframe and errors, through a schedule.
+"""Simulate a batch of vehicles, each with its own airframe and errors, through a schedule.
 
-What happens in each step, in this order:
+Each step, in this order:
 
 1. setpoints that are due arrive, unless the link is lost;
-2. snapshots of this step, or of what has just arrived, are noted where they are wanted;
-3. the estimate misses what it has no poses for;
+2. snapshots are recorded, of this step or of arriving setpoints, if requested;
+3. without poses, the error of the estimate grows;
 4. the supervisor levels out, or stops the motors, by its time-outs;
-5. the controller asks the motors for thrusts;
+5. the controller commands the motors;
 6. the body moves;
-7. what it comes to is reduced: the box that it sweeps, its worst deviation and tilt.
+7. the results are updated: the box that the vehicle sweeps, its worst deviation and tilt.
 
-Lanes are independent: which others are in the batch changes nothing.
+Lanes are independent: the other vehicles of a batch have no effect.
 """
 
 from collections.abc import Iterator
@@ -42,16 +42,16 @@ from cfplan.simulation.engine.layout import (
 from cfplan.simulation.engine.mellinger import FULL_STATE, LEVEL_OUT, ON_BOARD, Gains, ask, mellinger, mixed
 
 NEVER = 2**40  # ms
-PART = 150  # ms of a sweep in one box, if there are several
-_WORTH_THREADS = 2_000_000  # lanes and their ms, of which threads are worth their beginning
-# Rows behind those of the vehicle: box swept, setpoint that is due, squared deviation, cosine of tilt, and what the
-# estimate misses more and more of without poses, m/s².
+PART = 150  # ms of motion per box, if there are several
+_WORTH_THREADS = 2_000_000  # lanes times ms, above which a second thread saves time
+# Rows behind those of the vehicle: box swept, setpoint that is due, squared deviation, cosine of tilt, and the
+# acceleration by which the estimate is wrong without poses, m/s².
 _LOW, _HIGH, _DUE, _FARTHEST, _LEAST_LIFT, _BLIND = (VEHICLE_SIZE + k for k in (0, 3, 6, 9, 10, 11))
 _ROWS = VEHICLE_SIZE + 14
 
 
 class Vehicles(NamedTuple):
-    """Vehicles, and what becomes of their links."""
+    """Vehicles, and the state of their links."""
 
     snapshots: NDArray  # (L, 31) at the beginning, as in `layout`
     airframes: NDArray  # (L, 26) as `pack_airframe` makes them
@@ -62,7 +62,7 @@ class Vehicles(NamedTuple):
 
 
 class Schedule(NamedTuple):
-    """What happens when, from the beginning on."""
+    """The events of a simulation and their times, ms from its beginning."""
 
     setpoints: NDArray  # (N, 20) as in `mellinger`
     arrivals: NDArray  # (N,) int, ms; each lane's time begins when its first one arrives
@@ -74,13 +74,13 @@ class Schedule(NamedTuple):
     blind_until: int = NEVER  # ms until which there are no poses
     level_after: int = NEVER  # ms after which the vehicle levels out
     off_after: int = NEVER  # ms after which motors stop, for good; the simulation ends on the floor then
-    spread: NDArray = np.zeros(1)  # (steps or 1,) m that boxes are wider to the sides, after each step
-    latency: int = 0  # ms by which the estimate is late, where traces are wanted
+    spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
+    latency: int = 0  # ms by which the estimate is late; used with traces
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
 
 
 class Outcome(NamedTuple):
-    """What is found out; parts have no rows where they are not wanted. Once all have landed, snapshots are NaN."""
+    """The results; arrays that were not requested have no rows. After all vehicles have landed, snapshots are NaN."""
 
     boxes: NDArray  # (L, S, 2, 3) m, low and high corners swept, in S parts of the time
     deviation: NDArray  # (L,) m, worst distance from the setpoint that is due
@@ -90,12 +90,12 @@ class Outcome(NamedTuple):
 
 
 def arrival_times(count: int, rate: float) -> NDArray:
-    """Return when so many setpoints at `rate`, Hz, arrive, (count,) ms."""
+    """Return the arrival times of `count` setpoints at `rate`, Hz, (count,) ms."""
     return np.round(np.arange(count) * (1000 / rate)).astype(np.int64)
 
 
 def simulate(batch: Vehicles, schedule: Schedule, *, parts: int = 1, arrived: int = 0, trace: bool = False) -> Outcome:
-    """Return what becomes of a batch: boxes in so many parts, snapshots of the first `arrived` setpoints, a trace."""
+    """Simulate a batch; return boxes in `parts` parts, snapshots at the first `arrived` setpoints, and a trace."""
     count = len(batch.snapshots)
     found = Outcome(
         np.empty((count, parts, 2, 3)),
@@ -116,7 +116,7 @@ def simulate(batch: Vehicles, schedule: Schedule, *, parts: int = 1, arrived: in
 
 
 def _split(batch: Vehicles, found: Outcome, work: int) -> Iterator[tuple[Vehicles, Outcome]]:
-    """Cut a batch in two halves where that is worth it."""
+    """Split a batch into halves if two threads save time."""
     count = len(batch.snapshots)
     middle = count // (2 * WIDTH) * WIDTH if work > _WORTH_THREADS else 0
     for some in (slice(0, middle), slice(middle, count)) if middle else (slice(0, count),):
@@ -124,7 +124,7 @@ def _split(batch: Vehicles, found: Outcome, work: int) -> Iterator[tuple[Vehicle
 
 
 class _Lanes(NamedTuple):
-    """Vehicles of a batch that are flown at once."""
+    """The vehicles of a batch that are simulated at once."""
 
     values: NDArray  # (_ROWS * WIDTH,) as in `layout`
     newest: NDArray  # (WIDTH,) int, row of the setpoint that is due
@@ -171,7 +171,7 @@ def _fly(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome) -> 
 
 @register_jitable
 def _begin(lanes: _Lanes, batch: Vehicles, schedule: Schedule) -> None:
-    """Put vehicles into lanes."""
+    """Load vehicles into lanes."""
     values = lanes.values
     for n in range(lanes.size):
         number = lanes.first + n
@@ -189,7 +189,7 @@ def _begin(lanes: _Lanes, batch: Vehicles, schedule: Schedule) -> None:
 
 @register_jitable
 def _receive(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome, now: int) -> int:
-    """Let the setpoints arrive that are due, and note snapshots; return when, ms, there is something to do again."""
+    """Deliver the setpoints that are due, and record snapshots; return when to call this again, ms."""
     again = NEVER
     for n in range(lanes.size):
         number, newest = lanes.first + n, lanes.newest[n]
@@ -232,7 +232,7 @@ def _supervise(values: NDArray, schedule: Schedule, now: int) -> None:
 
 @register_jitable
 def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int, part: int) -> int:
-    """Reduce what step k has come to; return the number of the box that it goes on in."""
+    """Update the results after step k; return the number of the current box."""
     aside = schedule.spread[min(k, len(schedule.spread) - 1)]
     _widen(lanes.values, used, aside)
     after = min((k + 1) * schedule.step // PART, found.boxes.shape[1] - 1)
@@ -247,7 +247,7 @@ def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int
 
 @register_jitable
 def _end(lanes: _Lanes, found: Outcome, part: int) -> None:
-    """Write what was reduced; boxes of the time that is left are where the vehicle lies."""
+    """Write the results; for the remaining time the boxes enclose the vehicle where it lies."""
     for n in range(lanes.size):
         number = lanes.first + n
         for each in range(part, found.boxes.shape[1]):
@@ -270,7 +270,7 @@ def _read_snapshot(snapshot: NDArray, lanes: NDArray, n: int) -> None:
 
 @njit(allocates=False, error_model="numpy")
 def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
-    """Let all estimates miss what an error of acceleration makes of so many s without poses."""
+    """Set the errors of all estimates from an error of acceleration over `blind_for`, s without poses."""
     count = min(count, WIDTH)  # the compiler must see that no index overflows
     for n in range(count):
         x, y, z = vector(lanes, WIDTH, n, _BLIND)
@@ -281,7 +281,7 @@ def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
 
 @register_jitable
 def _err(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
-    """Let all estimates be late and noisy besides."""
+    """Add latency and noise to the errors of all estimates."""
     seen = max(k - schedule.latency // schedule.step, 0)
     for n in range(lanes.size):
         for row in range(6):

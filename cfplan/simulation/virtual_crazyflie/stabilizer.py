@@ -41,7 +41,7 @@ from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
-# Where each lies in the array of whole numbers: counts, the setpoint's modes, and what the next run is told.
+# Indices in the array of integers: counts, the setpoint's modes, and the inputs of the next run.
 OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
 _MODE, _IN_BODY, _ALLOWED, _FLYING, _ASKED, _MELLINGER, _NUMBERS = 3, 10, 11, 12, 13, 14, 15
 
@@ -73,7 +73,7 @@ class Loop(NamedTuple):
     gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
     pid_gains: NDArray  # (12, 5) see `pid`
     pid_limits: NDArray  # (5,)
-    counts: NDArray  # (15,) int: OFF_TICKS, OFF_IN_AIR_TICKS, RESETS, and what the next run is told
+    counts: NDArray  # (15,) int: OFF_TICKS, OFF_IN_AIR_TICKS, RESETS, and the inputs of the next run
     noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
 
 
@@ -185,7 +185,7 @@ def _run(
 
 @register_jitable
 def _control(loop: Loop, now: int) -> None:
-    """Step the controller that flies, on what the filter believes."""
+    """Step the active controller on the filter's estimate."""
     mode = loop.counts[_MODE:_IN_BODY]
     if loop.counts[_MELLINGER]:
         control = step_mellinger(loop.vehicle, loop.gains, mode, loop.belief, CONTROL_PERIOD)
