@@ -2,7 +2,7 @@
 
 Each flight starts from its log's first record and is flown closed loop with the gains that flew. Nothing is fitted to
 the deviation. Held out: parameters are those of other flights of the family; only the thrust scale is the flight's own,
-of its first second. Data: ../shared/data/flights; no log is kept here.
+of its first second. The logs are not kept here.
 """
 
 import math
@@ -253,4 +253,4 @@ def tables(settings: Settings, rows: list[PredictedFlight]) -> Iterator[Table]:
     yield table("flights", "Each flight", FLIGHTS, listed)
 
 
-STUDY = Study(Settings, work, tables, "../shared/data/flights -o results/real-flights.json")
+STUDY = Study(Settings, work, tables, "public-flights -o results/real-flights.json")

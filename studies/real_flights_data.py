@@ -1,4 +1,4 @@
-"""Read the public flights of ../shared/data/flights: columns in NPZ, vehicle, controller and reference in JSON."""
+"""Read a folder of public flights: columns in NPZ, vehicle, controller and reference in JSON."""
 
 import json
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ def flights_of(folder: Path) -> dict[str, Path]:
     files = sorted(file for file in folder.glob("*.json") if file.name != "index.json")
     found = {file.stem: file for file in files if _known(json.loads(file.read_text()))}
     if not found:
-        hint = "the public flights lie in ../shared/data/flights"
+        hint = "name the folder of the public flights, with its index.json"
         raise InputError("no flights with a known reference", where=str(folder), hint=hint)
     return found
 

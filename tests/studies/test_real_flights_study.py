@@ -91,4 +91,4 @@ def test_flights_without_a_known_reference_are_left_out():
 def test_a_folder_without_flights_is_refused(tmp_path):
     with pytest.raises(InputError, match="no flights") as refused:
         run_study("real-flights", "studies.real_flights", STUDY, Settings(tmp_path))
-    assert "shared/data/flights" in refused.value.hint
+    assert "index.json" in refused.value.hint
