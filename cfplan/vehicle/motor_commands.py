@@ -25,14 +25,6 @@ def command_shares(pwm: NDArray, battery_voltage: NDArray, airframe: Airframe) -
     return np.where(share > 0.0, np.maximum(thrust, 0.0) / full, 0.0)
 
 
-def command_share(pwm: float, battery_voltage: float, airframe: Airframe) -> float:
-    """Return the share of the full command that a motor gives at a PWM, 16 bits, and a battery's voltage, V.
-
-    At full PWM a motor gives more than its full command while the battery lasts.
-    """
-    return float(command_shares(np.array([[pwm]]), np.array([battery_voltage]), airframe)[0, 0])
-
-
 def compensated_pwm(share: float, battery_voltage: float, airframe: Airframe) -> float:
     """Return the PWM, 16 bits, for a fraction of the full command at a battery voltage, V."""
     if not any(airframe.motor_curve):

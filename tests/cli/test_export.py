@@ -30,7 +30,7 @@ def test_crazyswarm_reads_what_was_written(export, tmp_path):
     np.testing.assert_allclose(table[0, [1, 9, 17, 25]], [-1.2, -1.2, 0.7, 0.0], atol=1e-6)
     assert ended.json["certificate"]["passed"]
     assert ended.json["dry_run"]["passed"]
-    assert ended.json["dry_run"]["deviation_median"] < 0.03  # of drawn vehicles, on the filter's estimate
+    assert ended.json["dry_run"]["deviation_median"] < 0.035  # of drawn vehicles, on the filter's estimate
     # And the last of them ends at rest where the path does.
     end = np.array([np.polynomial.Polynomial(table[-1, k : k + 8])(table[-1, 0]) for k in (1, 9, 17)])
     np.testing.assert_allclose(end, [1.2, -0.6, 0.9], atol=1e-4)

@@ -61,11 +61,7 @@ def prepare(
             _listen_while_armed(loop)
             _require(standing_check(stood, loop.pose().position, loop.mission.limits), "motion capture")
             return floor
-    raise PreflightError(
-        "the vehicle does not arm",
-        hint="restart the vehicle; a brushless one arms from firmware 2026.08 on only if powerDist.idleThrust, 7000 by "
-        "default, turns all of its rotors",
-    )
+    raise PreflightError("the vehicle does not arm", hint="restart the vehicle")
 
 
 def _configure(loop: FlightLoop) -> dict[str, float]:

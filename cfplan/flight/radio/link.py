@@ -268,7 +268,7 @@ class Link:
             self._radio_lock.close()
 
     def restart(self) -> None:
-        """Restart the vehicle's main processor, after `close`; takes 4 s. Raises LinkError if it does not confirm."""
+        """Restart the vehicle's main processor, after `close`; takes 2 s. Raises LinkError if it does not confirm."""
         restart_vehicle(self.uri, self._clock)
 
     def note_acknowledgement(self) -> None:

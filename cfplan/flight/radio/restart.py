@@ -6,7 +6,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 # In a packet for the link port's null channel; the vehicle's radio processor obeys it, its main processor need not run.
 POWER_CHANNEL, POWER = 3, 0xFE
 SYSTEM_OFF, SYSTEM_ON = 2, 3
-BOOT = 3.0  # s from power on until it may be armed, at most: 2.6 s with firmware 2026.08 beside a simulated body
+BOOT = 1.0  # s from power on until it answers, at most
 _TRIES = 3
 
 

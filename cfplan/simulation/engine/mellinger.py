@@ -212,14 +212,14 @@ def _moments(
 
 
 @register_jitable(forceinline=True)
-def mixed(control: Quadruple, most: float = FULL_COMMAND) -> Quadruple:
-    """Return the command of each motor, in [0, most]: all are lowered by the excess of the largest."""
+def mixed(control: Quadruple) -> Quadruple:
+    """Return the command of each motor, in [0, FULL_COMMAND]: all are lowered by the excess of the largest."""
     thrust, half_roll, half_pitch, spin = control[0], np.trunc(control[1] / 2), np.trunc(control[2] / 2), control[3]
     first = np.trunc(thrust - half_roll + half_pitch + spin)
     second = np.trunc(thrust - half_roll - half_pitch - spin)
     third = np.trunc(thrust + half_roll - half_pitch + spin)
     fourth = np.trunc(thrust + half_roll + half_pitch - spin)
-    excess = max(0.0, first - most, second - most, third - most, fourth - most)
+    excess = max(0.0, first - FULL_COMMAND, second - FULL_COMMAND, third - FULL_COMMAND, fourth - FULL_COMMAND)
     return max(first - excess, 0.0), max(second - excess, 0.0), max(third - excess, 0.0), max(fourth - excess, 0.0)
 
 

@@ -70,6 +70,3 @@ DEFAULTS: dict[str, float] = {
     "kalman.mNBaro": 2.0,
     **_pid_defaults(),
 }
-
-# What the brushless build has otherwise (MOTORS_DEFAULT_IDLE_THRUST in src/modules/src/Kconfig).
-BRUSHLESS_DEFAULTS: dict[str, float] = {"powerDist.idleThrust": 7000}

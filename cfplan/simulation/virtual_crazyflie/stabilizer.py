@@ -68,7 +68,6 @@ class Loop(NamedTuple):
     motors: NDArray  # (4,) 16-bit commands
     override: NDArray  # (5,) motorPowerSet: whether its commands count, 2 and 3 the first for all; 16-bit commands
     idle: NDArray  # (1,) 16-bit command that no motor falls below while it may turn
-    most: NDArray  # (1,) 16-bit command that a motor gives at full PWM
     prior: NDArray  # (16,) the filter's parameters, see `kalman`
     gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
     pid_gains: NDArray  # (12, 5) see `pid`
@@ -77,7 +76,7 @@ class Loop(NamedTuple):
     noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
 
 
-_FLOATS = VEHICLE_SIZE + 272  # of all parts together
+_FLOATS = VEHICLE_SIZE + 271  # of all parts together
 
 
 @register_jitable
@@ -101,7 +100,6 @@ def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
         gains=more[187:206],
         pid_gains=more[206:266].reshape(12, 5),
         pid_limits=more[266:271],
-        most=more[271:272],
         counts=counts,
         noise=noise,
     )
@@ -120,7 +118,6 @@ class Stabilizer:
         loop.vehicle[AIRFRAME:] = pack_airframe(airframe, floor=float(position[2]))
         loop.prior[:], loop.gains[:] = prior, gains
         loop.pid_gains[:], loop.pid_limits[:] = default_gains(), default_limits()
-        loop.most[0] = FULL_COMMAND
         self.mellinger = False  # which of the two controllers flies
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
         reset(loop.kalman, loop.prior)
@@ -195,7 +192,7 @@ def _control(loop: Loop, now: int) -> None:
         step_pid(
             loop.control, loop.pid_memory, loop.pid_gains, loop.pid_limits, setpoint, mode, in_body, loop.belief, now
         )  # fmt: skip
-    commands = mixed((loop.control[0], loop.control[1], loop.control[2], loop.control[3]), loop.most[0])
+    commands = mixed((loop.control[0], loop.control[1], loop.control[2], loop.control[3]))
     loop.motors[0], loop.motors[1], loop.motors[2], loop.motors[3] = commands
 
 

@@ -36,7 +36,6 @@ PERIOD = 40  # ms
 LEVEL_OUT_AFTER, SHUT_DOWN_AFTER = 500, 2000  # ms without a setpoint
 _FLYING_HYSTERESIS = 2000  # ms without more than idle thrust
 _KEEP_ALIVE_WITHIN = 1000  # ms between keep-alive packets, after the first one
-_SPIN_UP = 500  # ms of arming in which all rotors turn, before they count as checked
 _TILTED, _TILTED_FOR = 0.5, 1000  # g along the body's z axis, ms
 _UPSIDE_DOWN, _UPSIDE_DOWN_FOR = -0.2, 100
 _WEIGHTLESS = 0.1  # g
@@ -49,7 +48,6 @@ class Settings:
     tumble_check: bool = True
     preflight_timeout: int = 30000  # ms armed without a flight
     landed_timeout: int = 3000  # ms
-    spin_up_timeout: int = 2000  # ms of arming
     crash_detection: float = 0.0  # g beyond 1; 0 is off
     stop: bool = False  # emergency stop
     idle_thrust: float = 0.0  # 16-bit units, of the power distribution
@@ -65,17 +63,12 @@ class _Conditions:
     emergency: bool
     preflight_over: bool
     landing_over: bool
-    spun_up: bool
-    spin_up_over: bool
 
 
 class Supervisor:
-    """The firmware's supervisor; `say` prints a line on the console.
+    """The firmware's supervisor; `say` prints a line on the console."""
 
-    Where it `checks_rotors`, as of a brushless vehicle from firmware 2026.08 on, all of them must turn before it flies.
-    """
-
-    def __init__(self, *, auto_arming: bool, say: Callable[[str], None], checks_rotors: bool = False):
+    def __init__(self, *, auto_arming: bool, say: Callable[[str], None]):
         self.state = State.NOT_INITIALIZED
         self.settings = Settings()
         self.auto_arming = auto_arming
@@ -84,13 +77,11 @@ class Supervisor:
         self.tumbled = False
         self.deck_fault = False  # of a deck that tests itself
         self.ever_locked = False
-        self._say, self._checks_rotors = say, checks_rotors
+        self._say = say
         self._emergency = False
         self._keep_alive: int | None = None
         self._thrust_tick: int | None = None
         self._tilted_since: int | None = None
-        self._arming_tick = 0
-        self._turning_since: int | None = None
         self._armed_tick = 0
         self._landed_tick: int | None = None
 
@@ -152,10 +143,6 @@ class Supervisor:
     def _conditions(self, tick: int, setpoint_tick: int, acceleration: NDArray, motors: NDArray) -> _Conditions:
         if any(motor > self.settings.idle_thrust for motor in motors.tolist()):
             self._thrust_tick = tick
-        if self.state is not State.ARMING or not motors.all():
-            self._turning_since = None
-        elif self._turning_since is None:
-            self._turning_since = tick
         age = tick - setpoint_tick
         starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_WITHIN
         return _Conditions(
@@ -167,9 +154,6 @@ class Supervisor:
             emergency=self._emergency or starved or self.settings.stop,
             preflight_over=tick - self._armed_tick > self.settings.preflight_timeout,
             landing_over=self._landed_tick is not None and tick - self._landed_tick > self.settings.landed_timeout,
-            spun_up=not self._checks_rotors
-            or (self._turning_since is not None and tick - self._turning_since >= _SPIN_UP),
-            spin_up_over=tick - self._arming_tick > self.settings.spin_up_timeout,
         )
 
     def _is_tumbled(self, tick: int, acceleration: NDArray) -> bool:
@@ -231,18 +215,14 @@ class Supervisor:
         if not now.armed:
             return State.CHECKS_NOT_PASSED
         if self.state is State.ARMING:
-            if now.spin_up_over:
-                return State.CHECKS_NOT_PASSED
-            return State.READY_TO_FLY if now.spun_up else self.state
+            return State.READY_TO_FLY
         if now.preflight_over:
             return State.CHECKS_NOT_PASSED
         return State.FLYING if now.flying else self.state
 
     def _enter(self, state: State, tick: int) -> None:
         self.state = state
-        if state is State.ARMING:
-            self._arming_tick = tick
-        elif state is State.READY_TO_FLY:
+        if state is State.READY_TO_FLY:
             self._armed_tick = tick
         elif state is State.LANDED:
             self._landed_tick = tick

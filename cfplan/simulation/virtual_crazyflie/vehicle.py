@@ -15,7 +15,6 @@ from cfplan.simulation.virtual_crazyflie.catalogue import lacking
 from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
 from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
 from cfplan.simulation.virtual_crazyflie.defaults import (
-    BRUSHLESS_DEFAULTS,
     COMPLEMENTARY,
     DEFAULTS,
     KALMAN,
@@ -40,12 +39,10 @@ from cfplan.simulation.virtual_crazyflie.supervisor import PERIOD as SUPERVISOR_
 from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
 from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.motor_commands import FULL_COMMAND, command_share
 from cfplan.vehicle.rotations import yaw_of
 
 COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
-# ms from power on, as firmware 2026.08 takes: until it answers, and until its sensors are calibrated
-_BOOT, _CALIBRATED = 1900, 2480
+_BOOT = 500  # ms from power on until it answers
 _CONNECTION_LASTS = round(1000 * Timeouts().connection)  # ms
 
 _SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
@@ -58,7 +55,7 @@ _NO_POSES = np.zeros((0, 9))
 _MOTORS_OFF = Setpoint()
 
 _SUPERVISOR_SINCE = 12  # protocol with which the port came
-_DECKS_SUPERVISED_SINCE = _ROTORS_CHECKED_SINCE = (2026, 8)  # firmware
+_DECKS_SUPERVISED_SINCE = (2026, 8)  # firmware
 
 
 class VirtualCrazyflie:
@@ -72,7 +69,6 @@ class VirtualCrazyflie:
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
         self._estimator: int | None = None  # that a deck has chosen
         self._runs_from: float = 0  # tick from which its processor listens and answers
-        self._supervised_from: float = 0  # tick from which its supervisor runs
         self.battery = Battery(self.settings.charge, self.settings.capacity)
         self._boot()
 
@@ -82,9 +78,7 @@ class VirtualCrazyflie:
         self._commanded = -1  # the last tick at which the slower loops ran
         self._heard = self.tick  # tick of the last packet
         self._silent: tuple[str, ...] = ()  # variables whose log blocks are not sent
-        brushless = "brushless" in airframe.name
-        defaults = DEFAULTS | BRUSHLESS_DEFAULTS if brushless else DEFAULTS
-        self.parameters = Parameters(defaults, without=without, stubborn=self.settings.stubborn)
+        self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
         self.stabilizer = Stabilizer(
             airframe,
             self.settings,
@@ -92,9 +86,8 @@ class VirtualCrazyflie:
             gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
         )
         wanted = self.settings.auto_arming
-        auto_arming = not brushless if wanted is None else wanted
-        checks_rotors = brushless and self._version >= _ROTORS_CHECKED_SINCE
-        self.supervisor = Supervisor(auto_arming=auto_arming, say=self.say, checks_rotors=checks_rotors)
+        auto_arming = "brushless" not in airframe.name if wanted is None else wanted
+        self.supervisor = Supervisor(auto_arming=auto_arming, say=self.say)
         self.memories = Memories()
         self.planner = HighLevelCommander(self.memories.trajectory, self._where)
         self.commander = Commander(self.planner.stop)
@@ -118,7 +111,6 @@ class VirtualCrazyflie:
         )
         self._avoidance = CollisionAvoidance()
         self._watch_parameters()
-        self._set_idle_thrust(self.parameters["powerDist.idleThrust"])
         self.parameters.restore(self.settings.stored)
         if self._estimator is not None:
             self.parameters["stabilizer.estimator"] = self._estimator
@@ -136,10 +128,9 @@ class VirtualCrazyflie:
             after = self.stabilizer.loop
             after.truth[:], after.counts[:] = before.truth, before.counts
             after.truth[MOTORS] = 0.0
-            self._runs_from = self._supervised_from = math.inf
+            self._runs_from = math.inf
         elif command == SYSTEM_ON:
             self._runs_from = min(self._runs_from, self.tick + _BOOT)
-            self._supervised_from = self._runs_from + _CALIBRATED - _BOOT
         self._out.append(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
 
     def inject(self, fault: VehicleFault) -> None:
@@ -231,13 +222,12 @@ class VirtualCrazyflie:
             wanted = self.planner.setpoint(self.tick / 1000)
             if wanted is not None:
                 self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
-        if self.tick % SUPERVISOR_PERIOD == 0 and self.tick >= self._supervised_from:
+        if self.tick % SUPERVISOR_PERIOD == 0:
             self.supervisor.update(
                 self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
             )
         self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
-        most = command_share(FULL_COMMAND, self.battery.voltage, self._airframe)
-        loop.most[0], loop.vehicle[THRUST_MAX] = most * FULL_COMMAND, most * self._airframe.motor_thrust_max
+        self.stabilizer.loop.vehicle[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
         while self._answers and self._answers[0][0] <= self.tick:
             _, answer = self._answers.pop(0)
             self._send(Port.PARAMETERS, answer[0], answer[1:])
@@ -384,7 +374,6 @@ class VirtualCrazyflie:
         watch("supervisor.tmblChckEn", lambda value: setattr(supervised, "tumble_check", bool(value)))
         watch("supervisor.prefltTimeout", lambda value: setattr(supervised, "preflight_timeout", int(value)))
         watch("supervisor.landedTimeout", lambda value: setattr(supervised, "landed_timeout", int(value)))
-        watch("supervisor.spinupTimeout", lambda value: setattr(supervised, "spin_up_timeout", int(value)))
         watch("supervisor.crashDetectGs", lambda value: setattr(supervised, "crash_detection", value))
         for place, name in enumerate(("enable", "m1", "m2", "m3", "m4")):
             watch(f"motorPowerSet.{name}", fill(self.stabilizer.loop.override, place))

@@ -5,12 +5,11 @@ import struct
 import numpy as np
 import pytest
 
-from cfplan.simulation.engine.layout import MOTORS
+from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.wire import Port
-from cfplan.vehicle.motor_commands import FULL_COMMAND, command_share
 from tests.simulation.virtual_crazyflie.conftest import Rig
 
 HOVER, TAKE_OFF = 0.5, 7
@@ -87,17 +86,11 @@ def test_a_battery_sags_to_the_voltage_named_and_comes_back(hovering):
     assert hovering.vehicle.battery.voltage > 3.5
 
 
-@pytest.mark.parametrize(("voltage", "weak"), [(3.0, True), (3.9, False)])
-def test_motors_give_what_the_battery_lets_them_be_it_less_or_more_than_their_full_command(hovering, voltage, weak):
-    hovering.vehicle.inject(VehicleFault(VehicleFaultKind.BATTERY, 0.0, 2.0, voltage))
-    hovering.run(0.1)
-    hovering.go_to(0.0, 0.0, 9.0, duration=0.6)  # far faster than it can
-    hovering.run(0.6)
-    share = hovering.truth[MOTORS].max() / hovering.airframe.motor_thrust_max
-    assert share == pytest.approx(
-        command_share(FULL_COMMAND, hovering.vehicle.battery.voltage, hovering.airframe), rel=0.1
-    )
-    assert (share < 1.0) == weak
+@pytest.mark.parametrize(("voltage", "thrust"), [(3.0, 0.113), (3.066, 0.12), (3.7, 0.12)])
+def test_motors_weaken_with_voltage_as_measured(voltage, thrust):
+    battery = Battery()
+    battery.voltage = voltage
+    assert 0.12 * battery.strength == pytest.approx(thrust, abs=5e-4)
 
 
 def test_a_stubborn_parameter_keeps_its_value():

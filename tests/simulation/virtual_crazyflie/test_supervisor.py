@@ -5,7 +5,6 @@ import struct
 import numpy as np
 import pytest
 
-from cfplan.flight.radio.restart import BOOT, POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.flight.radio.supervisor_bits import DECK_FAULT, HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -55,36 +54,6 @@ def test_a_brushless_vehicle_waits_for_a_request():
     assert hand.look(1.0)[-1] is State.CHECKS_PASSED
     assert hand.supervisor.request_arming(True)
     assert hand.look(0.08)[-1] is State.READY_TO_FLY
-
-
-def test_a_brushless_vehicle_flies_once_all_rotors_have_turned():
-    hand = Hand(auto_arming=False, checks_rotors=True)
-    hand.look(0.2)
-    assert hand.supervisor.request_arming(True)
-    assert set(hand.look(1.0)[1:]) == {State.ARMING}
-    states = hand.look(0.8, motors=np.full(4, 7000.0))
-    assert states.index(State.READY_TO_FLY) == pytest.approx(0.5 / 0.04, abs=1)
-
-
-def test_a_brushless_vehicle_whose_rotors_do_not_turn_is_disarmed_after_two_seconds():
-    hand = Hand(auto_arming=False, checks_rotors=True)
-    hand.look(0.2)
-    assert hand.supervisor.request_arming(True)
-    states = hand.look(2.5, motors=np.array([7000.0, 7000.0, 0.0, 7000.0]))
-    assert states.index(State.CHECKS_NOT_PASSED) == pytest.approx(2.0 / 0.04, abs=2)
-    assert not hand.supervisor.armed
-
-
-@pytest.mark.parametrize(
-    ("idle", "firmware", "flies"), [(7000, "2026.08", True), (0, "2026.08", False), (0, "2026.04", True)]
-)
-def test_idle_thrust_turns_the_rotors_that_arming_checks(idle, firmware, flies):
-    settings = VehicleSettings(firmware=firmware, stored={"powerDist.idleThrust": idle})
-    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1-brushless"], settings)
-    vehicle.advance(200)
-    assert vehicle.supervisor.request_arming(True)
-    vehicle.advance(1000)
-    assert vehicle.supervisor.can_fly == flies
 
 
 def test_the_airframe_says_whether_it_arms_itself():
@@ -225,19 +194,6 @@ def test_the_port_answers_arming_recovery_and_the_bits(make_rig):
     assert rig.send(Port.SUPERVISOR, 0, b"\x04")[0][1:] == b"\x84\x01"
     assert rig.send(Port.SUPERVISOR, 1, b"\x02")[0][1:] == b"\x82\x01\x01"
     assert rig.send(Port.SUPERVISOR, 1, b"\x01\x00")[0][1:] == b"\x81\x01\x00"
-
-
-def test_a_vehicle_that_is_restarted_answers_after_two_seconds_and_may_be_armed_before_three(rig):
-    rig.send(Port.LINK, POWER_CHANNEL, bytes((POWER, SYSTEM_OFF)))
-    rig.run(1.0)
-    rig.send(Port.LINK, POWER_CHANNEL, bytes((POWER, SYSTEM_ON)))
-    seen = []
-    rig.run(3.0, lambda _: seen.append((bool(rig.send(Port.LINK, 0, b"echo")), rig.state is State.READY_TO_FLY)))
-    answered, ready = np.array(seen).T
-    assert answered.argmax() / 100 == pytest.approx(1.9, abs=0.02)
-    assert ready.argmax() / 100 == pytest.approx(2.6, abs=0.1)
-    assert ready[-1]
-    assert ready.argmax() / 100 < BOOT
 
 
 def test_an_emergency_stop_packet_cuts_the_motors_in_flight(hovering):

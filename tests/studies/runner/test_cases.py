@@ -176,7 +176,7 @@ def test_a_killed_study_goes_on_from_where_it_was(tmp_path):
     result = read_result(out)
     assert not unfinished(out).exists()
     assert [row["path"] for row in result.table("dry-runs").rows] == ["circle", "line", "slalom", "figure8"]
-    assert result.table("dry-runs").rows[0]["deviation_105_ms"] == first["rows"][0]["deviation_105_ms"]
+    assert result.table("dry-runs").rows[0]["time_lost"] == first["rows"][0]["time_lost"]
     assert result.seconds > first["seconds"]
 
 
