@@ -98,7 +98,7 @@ SCENARIOS: tuple[Scenario, ...] = (
     _radio("radio loses 50 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.5),
     _radio("radio 30 ms slower", RadioFaultKind.DELAY, Rung.NONE, FOR_GOOD, 0.03),
     _radio("radio dead for 0.3 s", RadioFaultKind.DEAD, Rung.NONE, 0.3),
-    _radio("radio dead for 1 s", RadioFaultKind.DEAD, Rung.LAND, 1.0),
+    _radio("radio dead for 0.8 s", RadioFaultKind.DEAD, Rung.LAND, 0.8),
     Scenario(
         "radio dead for 3 s", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),), falls=True
     ),

@@ -322,7 +322,7 @@ class FlightLoop:
 
     def _end_motor_test(self, now: float) -> None:
         """End a motor test that was started since preflight, and raise AbortRaised; at each tick until it has ended."""
-        if now - self._asked_motor_test > MOTOR_TEST_PERIOD:
+        if self.health.uplink is FRESH and now - self._asked_motor_test > MOTOR_TEST_PERIOD:
             self._asked_motor_test = now
             self.link.ask_motor_test()
         if self.link.motor_test:
