@@ -206,9 +206,6 @@ class World:
     def open(self) -> None:
         self._poses.clear()
 
-    def tell_attitude(self, attitude) -> None:
-        pass
-
     def poses(self) -> list[Pose]:
         came, self._poses = self._poses, []
         return came

@@ -156,9 +156,6 @@ class RoomPoseSource:
         except (BlockingIOError, ConnectionRefusedError):  # nothing more; or the lab has ended
             return found
 
-    def tell_attitude(self, attitude: tuple[float, float, float, float]) -> None:
-        """Ignore the attitude: these poses are never flipped."""
-
     def close(self) -> None:
         if self._socket is not None:
             with suppress(OSError):  # the lab has gone before us
