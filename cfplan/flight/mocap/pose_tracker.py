@@ -136,7 +136,10 @@ class PoseTracker:
         expected = led if off <= SMALLEST_STEP else self._reckoned(pose.time)  # then the sensors count, too
         if expected is not None and math.dist(_sum(pose.position, self._offset), expected) > SMALLEST_STEP:
             x, y, z = (wanted - seen for wanted, seen in zip(expected, pose.position, strict=True))
-            self._offset = (x, y, z) if math.hypot(x, y, z) <= self._limits.jump else (0.0, 0.0, 0.0)
+            self._offset = x, y, z
+            if math.hypot(x, y, z) > self._limits.jump:  # too far to be kept back
+                self._offset = (0.0, 0.0, 0.0)
+                self._line.clear()  # a line across the step would show a speed
         self.step = (self.step or off) if any(self._offset) else 0.0
         return replace(pose, position=_sum(pose.position, self._offset)) if self.step else pose
 

@@ -51,7 +51,7 @@ class MocapSource:
     def _begin(self) -> None:
         self._frame_clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
-        self._hidden = 0  # frames without the body
+        self.hidden = 0  # frames without the body
         self.fault = ""  # why no pose comes; "" while poses come
 
     @property
@@ -122,7 +122,7 @@ class MocapSource:
         """Return the body's pose in a frame; None where it was not seen."""
         taken = self._frame_clock.taken(frame.received, frame.number, frame.rate, frame.latency)
         if not frame.bodies:
-            self.fault, self._hidden = str(Verdict.OCCLUDED), self._hidden + 1
+            self.fault, self.hidden = str(Verdict.OCCLUDED), self.hidden + 1
             return None
         self.fault, body = "", frame.bodies[0]
         return Pose(taken, frame.received, body.position, body.quaternion, frame.number)
@@ -154,7 +154,7 @@ class MocapSource:
 
     def _nothing_came(self, check: PoseCheck) -> CfplanError:
         assert self._feed is not None
-        counts = check.counts + Counter({Verdict.OCCLUDED: self._hidden})
+        counts = check.counts + Counter({Verdict.OCCLUDED: self.hidden})
         total = counts.total()
         where = str(self._uri)
         if not total:

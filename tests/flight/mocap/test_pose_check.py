@@ -45,10 +45,7 @@ def test_flight_goes_on_after_an_occlusion(gap):
 
 def test_a_body_sent_as_zeros_is_occluded():
     check, i = check_after()
-    assert (
-        check.judge(i * PERIOD, TrackedBody("cf1", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), i)
-        is Verdict.OCCLUDED
-    )
+    assert check.judge(i * PERIOD, TrackedBody("cf1", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), i) is Verdict.OCCLUDED
 
 
 def test_the_same_frame_again_is_repeated():

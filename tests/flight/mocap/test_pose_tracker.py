@@ -169,7 +169,8 @@ def test_a_late_pose_is_carried_on_by_the_sensors_or_not_sent():
 
 
 def test_a_pose_of_the_age_that_brakes_is_not_sent():
-    assert tracked(straight).to_send(_FEW[-1] + LIMITS.age_brake) is None
+    assert tracked(straight).to_send(_FEW[-1] + LIMITS.age_brake - 0.001) is not None
+    assert tracked(straight).to_send(_FEW[-1] + LIMITS.age_brake + 0.001) is None
 
 
 # Steps.
