@@ -111,15 +111,13 @@ class StartingVehicle:
         mocap = parse_uri(self._mocap_uri, subject_needed=True) if self._mocap_uri is not None else None
         if self._lab is not None:
             from cfplan.preparation.steps import step
-            from cfplan.simulation.lab.room import RoomPoseSource
 
             with step(on_step, "lab") as results:
                 lab = self._lab.wait()
                 results.append(f"the virtual Crazyflie is at {lab.uri}")
-            if mocap is None:
-                return RoomPoseSource(lab.number)
-            if mocap.host == VIRTUAL_VICON:
-                return pose_source(lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1), self._limits.pose)
+            if mocap is None or mocap.host == VIRTUAL_VICON:
+                system = mocap.system if mocap is not None else "vicon"
+                return pose_source(lab.mocap_uri.replace("vicon:", f"{system}:", 1), self._limits.pose)
         return pose_source(str(mocap), self._limits.pose)
 
     def __enter__(self) -> "StartingVehicle":

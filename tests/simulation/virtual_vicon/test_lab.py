@@ -27,7 +27,7 @@ LIMITS = PoseLimits(
 
 @pytest.fixture(scope="module")
 def lab():
-    room, beside = RoomSettings(vicon=ViconSettings(rate=200.0)), {"cf2": VehicleSettings(position=(0.5, 1.0, 0.0))}
+    room, beside = RoomSettings(ViconSettings(rate=200.0)), {"cf2": VehicleSettings(position=(0.5, 1.0, 0.0))}
     with start_lab(load_airframe("crazyflie-2.1+"), room=room, companions=beside, number=7) as lab:
         yield lab
 
