@@ -152,7 +152,7 @@ def _fly_once(
             RecordWriter(Path(folder), header) as writer,
             view(header) if view is not None else nullcontext() as watching,
         ):
-            poses = pose_source(lab.mocap_uri, mission.limits.pose)
+            poses = pose_source(lab.mocap_uri, mission.limits.pose, open_within=10.0)
             flight.outcome = pilot(uri=lab.uri, drivers=[SimDriver], pose_source=poses, on_telemetry=hear)
             flight.truth = lab.truth()
         flight.reason = flight.outcome.reason

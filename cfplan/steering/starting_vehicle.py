@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SIMULATED = "sim://"
 VIRTUAL_SUBJECT = "cf1"  # the only body that it sees
 VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
+_OPENS_WITHIN = 10.0  # s for its first poses: it is there, but this computer may be busy
 
 
 def check_uris(uri: str, mocap_uri: str | None) -> None:
@@ -109,7 +110,8 @@ class StartingVehicle:
                 lab = self._lab.wait()
                 results.append(f"the virtual Crazyflie is at {lab.uri}")
             if mocap.host == VIRTUAL_VICON:
-                return pose_source(lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1), self._limits.pose)
+                uri = lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1)
+                return pose_source(uri, self._limits.pose, open_within=_OPENS_WITHIN)
         return pose_source(str(mocap), self._limits.pose)
 
     def __enter__(self) -> "StartingVehicle":

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from septic_flight import septic_payloads
 from stepped_flight import Flight
+from waiting import PATIENCE
 
 from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.mission import Mission
@@ -59,7 +60,7 @@ def fly_in(patient_mission):
             telemetry.append(message)
             react(message)
 
-        source = pose_source(lab.mocap_uri, patient_mission.limits.pose)
+        source = pose_source(lab.mocap_uri, patient_mission.limits.pose, open_within=PATIENCE)
         outcome = fly(patient_mission, uri=lab.uri, drivers=[SimDriver], pose_source=source, on_telemetry=note)
         return Flight(outcome, telemetry, lab.truth())
 

@@ -105,7 +105,7 @@ def show(message):
 
 if __name__ == "__main__":
     mission = pickle.load(open(sys.argv[1], "rb"))
-    source = pose_source(sys.argv[2], mission.limits.pose)
+    source = pose_source(sys.argv[2], mission.limits.pose, open_within=30.0)
     fly(mission, uri="sim://2", drivers=[SimDriver], pose_source=source, on_telemetry=show)
 """
 

@@ -6,6 +6,7 @@ import signal
 import numpy as np
 import pytest
 from stepped_flight import Flight
+from waiting import PATIENCE
 
 from cfplan.air.process import AirPlanner
 from cfplan.air.requests import PathAnswer, Wish
@@ -44,7 +45,7 @@ def fly_with_planner(lab, patient_mission):
                 answers.extend(planner.answers())
                 react(message, planner)
 
-            source = pose_source(lab.mocap_uri, mission.limits.pose)
+            source = pose_source(lab.mocap_uri, mission.limits.pose, open_within=PATIENCE)
             outcome = fly(mission, uri=lab.uri, pose_source=source, pilot=pilot, on_telemetry=note)
             answers += planner.answers(1.0) if planner.alive else []
         return Flight(outcome, telemetry, lab.truth()), answers

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cflib.crazyflie.mem import MemoryElement, Poly4D
 from cflib.crtp.crtpstack import CRTPPort
-from waiting import until
+from waiting import PATIENCE, until
 
 from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
@@ -30,7 +30,7 @@ class PoseFeed(threading.Thread):
     def __init__(self, cf, mocap_uri):
         super().__init__(daemon=True)
         self.cf, self.stop = cf, threading.Event()
-        self.source = pose_source(mocap_uri, load_limits(SAFETY_FILE).pose)
+        self.source = pose_source(mocap_uri, load_limits(SAFETY_FILE).pose, open_within=PATIENCE)
         self.source.open()
         self.start_position = self.source.poses()[-1].position
         self.latest = None
