@@ -132,7 +132,7 @@ def test_hard_acceleration_costs_millimetres():
     assert tracker.position(ahead)[0] == pytest.approx(2.5 * ahead**2, abs=0.005)
 
 
-def test_noise_is_hardly_made_worse():
+def test_noise_grows_by_less_than_a_third():
     chance = np.random.default_rng(3)
     errors = [tracked(lambda _: tuple(chance.normal(1.0, 0.001, 3))).position(0.19 + 0.017) for _ in range(300)]
     assert np.std(errors) < 0.0013
