@@ -14,9 +14,9 @@ from waiting import PATIENCE, a_moment, until
 from cfplan.errors import LinkError
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
 from cfplan.flight.radio.connection import connect
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.vehicle.airframes import AIRFRAMES
 
 _STEP = 10  # ms of the vehicle's time at each look for a packet

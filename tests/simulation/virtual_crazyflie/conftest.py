@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import pytest
 
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.simulation.lab.room import MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.vehicle.airframes import AIRFRAMES
 
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
