@@ -15,14 +15,14 @@ from cfplan.flight.radio.transport import Fail, Hear, hand_on
 
 PATIENCE = 0.005  # s that a packet waits for a busy radio; then it is dropped, as the next one is fresher
 DEAD_AFTER = 10.0  # s without an acknowledgement; a vehicle that hovers alone is worth waiting for
-_UNPLUGGED_AFTER = 1.0  # s without an answer of the dongle itself
-_UNANSWERED_PAUSE = 0.001  # s; one that is unplugged fails at once
+_UNANSWERED_PAUSE = (
+    0.001  # s after a transmission that the dongle does not report on: one that is unplugged fails at once
+)
 _SAFELINK = bytes((0xFF, 0x05, 0x01))  # begins it; a vehicle that has it answers the same
 _TRIES = 10
 _UP, _DOWN = 3, 2  # bits of the header with the counters
 _COUNTERS = 1 << _UP | 1 << _DOWN
 _NULL = 0xF3  # header of an empty packet, without the counters
-_RETRANSMISSIONS = 3  # by the dongle itself, before it reports that nothing came
 _IDLE_AFTER, _IDLE_PERIOD = 10, 0.01  # acknowledgements without any byte; s between transmissions from then on
 
 
@@ -89,9 +89,9 @@ class Dongle:
                 self._ended.wait(_UNANSWERED_PAUSE)
             if answer is None or not answer.ack:
                 if now - acknowledged > DEAD_AFTER:
-                    return self._fail(f"the vehicle has acknowledged nothing for {DEAD_AFTER:g} s")
-                if now - answered > _UNPLUGGED_AFTER:
-                    return self._fail("the Crazyradio does not answer: is it unplugged?")
+                    alive = now - answered < DEAD_AFTER
+                    self._fail("the vehicle acknowledges nothing" if alive else "the Crazyradio does not answer")
+                    return
                 continue
             acknowledged, content = now, bytes(answer.data)
             up = 1 - up
@@ -107,7 +107,6 @@ class Dongle:
                     self._changed.wait_for(self._ended.is_set, self._period)
                 elif empty > _IDLE_AFTER:
                     self._changed.wait_for(lambda: not self._outbox.empty, _IDLE_PERIOD)
-        return None
 
 
 def open_dongle(uri: str, clock: Clock = REAL_CLOCK) -> Dongle:
@@ -120,5 +119,4 @@ def open_dongle(uri: str, clock: Clock = REAL_CLOCK) -> Dongle:
     radio.set_channel(channel)
     radio.set_data_rate(rate)
     radio.set_address(address)
-    radio.set_arc(_RETRANSMISSIONS)
     return Dongle(radio, clock, 1.0 / most if most else 0.0)

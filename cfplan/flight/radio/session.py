@@ -19,11 +19,11 @@ from cfplan.flight.radio.log_block import DATA_CHANNEL, DELETE, RESET, SETTINGS_
 from cfplan.flight.radio.table import Table, Tables, read_table
 from cfplan.flight.radio.transport import Transport
 
-CONNECTING = 30.0  # s, from the first answer to the last table, over a lossy radio that reads each item
+TABLES_WITHIN = 30.0  # s, from the first answer to the last table, over a lossy radio that reads each item
+PING_PERIOD = 0.1  # s
 READ_PARAMETER, WRITE_PARAMETER = 1, 2  # channels
 _ASK_AGAIN = 0.2  # s
 _LOOK_PERIOD = 0.02  # s between looks whether waiting is given up
-_PING_PERIOD = 0.1  # s
 _PINGS_KEPT = 100  # whose round trips count: 10 s
 _ECHO, _VERSION = 0, 1  # channels of the link and the platform port
 _PROTOCOL, _FIRMWARE = b"\0", b"\1"
@@ -60,18 +60,26 @@ class Session:
         transport.listen(self.hear, self.fail)
 
     def open(self, patience: float, tables: Tables) -> None:
-        """Ask for versions and tables, and begin to ping. Raises LinkError if nothing answers for `patience`, s."""
+        """Ask for versions and tables, and begin to ping.
+
+        Raises LinkError if nothing answers for `patience`, s, or if the tables do not come within 30 s.
+        """
         self.protocol = int.from_bytes(self.ask(Port.PLATFORM, _VERSION, _PROTOCOL, 1, patience)[1:2])
-        end = self.clock.now() + CONNECTING
+        end = self.clock.now() + TABLES_WITHIN
 
         def ask(port: Port, channel: int, payload: bytes, head: int) -> bytes:
-            return self.ask(port, channel, payload, head, end - self.clock.now(), "reading its tables")
+            return self.ask(port, channel, payload, head, end - self.clock.now())
 
-        version = ask(Port.PLATFORM, _VERSION, _FIRMWARE, 1)[1:]
-        self.firmware = version.split(b"\0")[0].decode("ascii", "replace")
         try:
+            version = ask(Port.PLATFORM, _VERSION, _FIRMWARE, 1)[1:]
+            self.firmware = version.split(b"\0")[0].decode("ascii", "replace")
             self.log_variables = read_table(Port.LOG, ask, tables)
             self.parameters = read_table(Port.PARAMETERS, ask, tables)
+        except LinkError as error:
+            if self.lost:
+                raise
+            raise LinkError("the vehicle answers, but its tables do not come through", where=self.uri,
+                            hint="move closer, or choose a freer channel") from error  # fmt: skip
         except (ValueError, IndexError, struct.error) as error:
             raise LinkError("the vehicle's tables are damaged", where=self.uri, hint="restart the vehicle") from error
         self.clock.repeat(self._ping, name="ping")
@@ -111,7 +119,7 @@ class Session:
         if len(self._pings) > _PINGS_KEPT:
             del self._pings[next(iter(self._pings))]
         self.send(pack(Port.LINK, _ECHO, content))
-        return _PING_PERIOD
+        return PING_PERIOD
 
     # What comes: in the transport's thread, and quick.
 
