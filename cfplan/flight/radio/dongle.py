@@ -1,4 +1,4 @@
-"""The transport by a Crazyradio: cflib opens and drives the dongle; what it transmits, and how often, is decided here.
+"""The transport by a Crazyradio: cflib drives the dongle; this file decides which packet it transmits next.
 
 The radio is polled: each transmission is acknowledged by the vehicle, whose packets come with the acknowledgements.
 Safelink counts the packets both ways by one bit each, in the header, so that a repetition is told from a new packet.
@@ -110,7 +110,7 @@ class Dongle:
 
 
 def open_dongle(uri: str, clock: Clock = REAL_CLOCK) -> Dongle:
-    """Open the Crazyradio of a radio:// URI. Raises what cflib and pyusb raise."""
+    """Open the Crazyradio of a radio:// URI. Raises the errors of cflib and pyusb."""
     from cflib.crtp.radiodriver import RadioDriver
     from cflib.drivers.crazyradio import Crazyradio
 

@@ -1,4 +1,4 @@
-"""The pilot's link to one Crazyflie: what it sends in flight, and what the vehicle reports of itself."""
+"""The pilot's link to one Crazyflie: commands in flight, and the vehicle's reports."""
 
 import math
 import struct
@@ -175,7 +175,7 @@ class Link:
         return self._session.read_parameter(name, patience)
 
     def upload_trajectory(self, content: bytes) -> bytes:
-        """Write the beginning of the trajectory memory, and return what it holds there. Raises LinkError."""
+        """Write the beginning of the trajectory memory, and return the same bytes as read back. Raises LinkError."""
         return self._session.write_trajectory_memory(content)
 
     def start_logs(self) -> None:

@@ -48,7 +48,7 @@ class LogBlock:
         return bytes((_STOP, self.number))
 
     def decode(self, message: bytes) -> dict[str, Any] | None:
-        """Return the values of a message by name; None where it has another length, as a block that is half created."""
+        """Return the values of a message by name; None if its length is wrong, as of a block that is half created."""
         layout = "<" + "".join(_TYPES[kind][1] for _, kind, _ in self.variables)
         if len(message) != _HEAD + struct.calcsize(layout):
             return None

@@ -1,4 +1,4 @@
-"""The packets that wait for a polled radio; setpoints and poses among them perish, as a vehicle takes them for fresh.
+"""Packets that wait for a polled radio; setpoints and poses among them perish, as a vehicle takes them for fresh.
 
 A Crazyradio repeats the packet in the air until it is acknowledged, and one more waits behind it. A radio that was dead
 would send both when it returns, and an old pose throws the vehicle's estimate back by as far as it has come since.

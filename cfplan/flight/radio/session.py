@@ -1,7 +1,7 @@
 """One CRTP session with a vehicle over any transport: requests with answers, parameters, logs, memory and pings.
 
-Whatever waits for an answer repeats its request until one comes, whether or not the transport is reliable: all requests
-may arrive twice. What is sent in flight never waits.
+A request is repeated until its answer comes, whether or not the transport is reliable: all requests may arrive twice.
+Packets of flight are sent once and wait for nothing.
 """
 
 import struct
@@ -23,8 +23,8 @@ TABLES_WITHIN = 30.0  # s, from the first answer to the last table, over a lossy
 PING_PERIOD = 0.1  # s
 READ_PARAMETER, WRITE_PARAMETER = 1, 2  # channels
 _ASK_AGAIN = 0.2  # s
-_LOOK_PERIOD = 0.02  # s between looks whether waiting is given up
-_PINGS_KEPT = 100  # whose round trips count: 10 s
+_LOOK_PERIOD = 0.02  # s between calls of `waiting`
+_PINGS_KEPT = 100  # for the round trip: 10 s
 _ECHO, _VERSION = 0, 1  # channels of the link and the platform port
 _PROTOCOL, _FIRMWARE = b"\0", b"\1"
 _MEMORY_INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
@@ -40,7 +40,7 @@ _LAYOUTS = {0x08: "<B", 0x09: "<H", 0x0A: "<I", 0x0B: "<Q", 0x00: "<b", 0x01: "<
 
 
 class Session:
-    """A session; `open` makes it usable. What waits calls `waiting`, which may raise, every 20 ms."""
+    """A session; `open` makes it usable. While it waits for an answer it calls `waiting`, which may raise."""
 
     def __init__(self, transport: Transport, uri: str, clock: Clock, waiting: Callable[[], None] = lambda: None):
         self.uri, self.clock = uri, clock
@@ -54,7 +54,7 @@ class Session:
         self._logs: dict[int, tuple[LogBlock, Callable[[int, dict[str, Any]], None]]] = {}
         self._wanted: tuple[int, int, bytes] | None = None  # port, channel and beginning of the answer waited for
         self._answer, self._answered = b"", threading.Event()
-        self._pings: dict[bytes, float] = {}  # that are not answered, with when, s, they were sent
+        self._pings: dict[bytes, float] = {}  # unanswered, each with the time, s, at which it was sent
         self._round_trips: deque[float] = deque(maxlen=_PINGS_KEPT)
         self._pinged = 0
         transport.listen(self.hear, self.fail)
@@ -121,7 +121,7 @@ class Session:
         self.send(pack(Port.LINK, _ECHO, content))
         return PING_PERIOD
 
-    # What comes: in the transport's thread, and quick.
+    # Callbacks: these run in the transport's thread and must be quick.
 
     def hear(self, packet: bytes) -> None:
         """Take a packet from the vehicle."""
@@ -229,7 +229,7 @@ class Session:
         return answer[2:3] == b"\0"
 
     def write_trajectory_memory(self, content: bytes) -> bytes:
-        """Write the beginning of the trajectory memory, and return what it then holds there.
+        """Write the beginning of the trajectory memory, and return the same bytes as read back.
 
         Raises LinkError if the vehicle has no such memory, or does not take or give all of it within 30 s.
         """

@@ -1,4 +1,4 @@
-"""The vehicle's tables of parameters and log variables, kept on disk by their checksums."""
+"""The vehicle's tables of parameters and log variables, cached on disk by their checksums."""
 
 import json
 import os
@@ -14,18 +14,18 @@ _CHANNEL = 0
 _ITEM, _INFO = b"\2", b"\3"
 
 Table = Mapping[str, tuple[int, int]]  # by full name: number in packets, and type as the wire has it
-Ask = Callable[[Port, int, bytes, int], bytes]  # port, channel, payload and bytes of the answer's head to that answer
+Ask = Callable[[Port, int, bytes, int], bytes]  # as `Session.ask`
 
 
 class Tables:
-    """Tables by port and checksum, as a vehicle's table changes with its checksum alone; kept in a folder if given."""
+    """Known tables by port and checksum, which changes with each table; also in a folder, if one is given."""
 
     def __init__(self, folder: Path | None = None):
         self._folder = folder
         self._known: dict[str, Table] = {}
 
     def add(self, port: Port, checksum: int, table: Table) -> None:
-        """Remember a table; where it cannot be written, for this process alone."""
+        """Add a table; where the folder cannot be written, for this process alone."""
         name = _name(port, checksum)
         self._known[name] = table
         if self._folder is not None:
@@ -47,7 +47,7 @@ def _name(port: Port, checksum: int) -> str:
 
 
 def tables_on_disk() -> Tables:
-    """Return the tables that are kept between connections; where no folder can be made, those of this process."""
+    """Return the tables that are cached between connections; where no folder can be made, for this process alone."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "cfplan" / "tables"
     try:
@@ -60,7 +60,7 @@ def tables_on_disk() -> Tables:
 def read_table(port: Port, ask: Ask, tables: Tables) -> Table:
     """Return the vehicle's table of a port, read item by item unless it is known.
 
-    Raises what `ask` raises, and ValueError, IndexError or struct.error if an answer is damaged.
+    Raises LinkError as `ask` does, and ValueError, IndexError or struct.error if an answer is damaged.
     """
     count, checksum = struct.unpack_from("<HI", ask(port, _CHANNEL, _INFO, 1), 1)
     table = tables.find(port, checksum)

@@ -1,4 +1,4 @@
-"""Transports carry packets between a session and a vehicle; here their protocol, and those by cflib's link drivers."""
+"""Transports carry packets between a session and a vehicle: their protocol, and the transport by a driver of cflib."""
 
 import logging
 import threading
@@ -7,8 +7,8 @@ from typing import Any, Protocol
 
 from cfplan.errors import LinkError
 
-_LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet looks whether it shall end
-_SENDING = 0.1  # s that a packet waits for another thread's, which the driver takes longer for than it should
+_LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet checks whether it must end
+_SENDING = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
 
 Hear = Callable[[bytes], None]
 Fail = Callable[[str], None]
@@ -29,9 +29,9 @@ class Transport(Protocol):
 
 
 def hand_on(receive: Callable[[float], bytes | None], hear: Hear, ended: threading.Event) -> None:
-    """Call `hear` in a thread with what `receive` returns, until `ended`; `receive` waits for as many s as it is told.
+    """Call `hear` in a thread with each packet that `receive` returns, until `ended`; `receive` takes its patience, s.
 
-    What fails in `hear` is logged, and the next packet heard: no packet may end a link.
+    An exception in `hear` is logged, and the next packet heard: no packet may end a link.
     """
 
     def run() -> None:
@@ -50,7 +50,7 @@ class DriverTransport:
     """A transport by one of cflib's link drivers."""
 
     def __init__(self, uri: str):
-        """Connect. Raises LinkError if no driver knows the URI, and what its driver raises."""
+        """Connect. Raises LinkError if no driver knows the URI, and the errors of its driver."""
         from cflib import crtp
 
         self._fail: Fail = lambda _: None
@@ -85,7 +85,7 @@ class DriverTransport:
         return None if packet is None else bytes((packet.header, *packet.data))
 
     def _failed(self, reason: str) -> None:
-        """Note why the link is gone, and close it: some drivers would go on reporting the same."""
+        """Note why the link is gone, and close it: some drivers report the same error over and over."""
         if not self._failure:
             self._failure = reason
             self._fail(reason)

@@ -3,7 +3,7 @@
 A Crazyradio sends one packet, gets at most one back with the acknowledgement, and repeats both until it has got it
 (cflib's safelink). Loss therefore costs time and nothing else, until one side's queue is full: the computer's holds
 the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old;
-but setpoints and poses that wait for long do not come, as the pilot's `Outbox` sees to, which is this radio's too.
+but setpoints and poses that wait for long do not come: both radios, real and simulated, send from an `Outbox`.
 """
 
 from collections import deque
