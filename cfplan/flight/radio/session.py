@@ -125,6 +125,8 @@ class Session:
 
     def hear(self, packet: bytes) -> None:
         """Take a packet from the vehicle."""
+        if not packet:
+            return
         port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1:]
         if (port, channel) == (Port.LOG, DATA_CHANNEL):
             self._take_log(payload)

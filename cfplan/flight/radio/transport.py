@@ -5,8 +5,6 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-from cfplan.errors import LinkError
-
 _LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet checks whether it must end
 _SENDING = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
 
@@ -50,7 +48,7 @@ class DriverTransport:
     """A transport by one of cflib's link drivers."""
 
     def __init__(self, uri: str):
-        """Connect. Raises LinkError if no driver knows the URI, and the errors of its driver."""
+        """Connect. Raises ValueError if no driver knows the URI, and the errors of its driver."""
         from cflib import crtp
 
         self._fail: Fail = lambda _: None
@@ -58,7 +56,7 @@ class DriverTransport:
         self._sending, self._ended = threading.Lock(), threading.Event()
         self._driver: Any = crtp.get_link_driver(uri, lambda _: None, self._failed)
         if self._driver is None:
-            raise LinkError("No driver found or malformed URI", where=uri)
+            raise ValueError("No driver found or malformed URI")
 
     def listen(self, hear: Hear, fail: Fail) -> None:
         self._fail = fail

@@ -44,7 +44,7 @@ class SteppedTransport:
     def restart(self) -> None:
         """Restart the vehicle's main processor, as cflib's power switch does."""
         for command, wait in ((SYSTEM_OFF, _POWER_OFF), (SYSTEM_ON, BOOT)):
-            self._lab.radio.send(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
+            self.send(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
             self._lab.clock.sleep(wait)
 
 
