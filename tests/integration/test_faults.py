@@ -335,7 +335,7 @@ def test_a_vehicle_that_fell_while_the_computer_stood_still_is_not_lifted_again(
     assert truth.position[down:, 2].max() < 0.1
     judged = judge(scenario, flown, line, readable=True)
     assert (judged.landed, judged.disarmed) == (True, True)
-    assert judged.to_wall > 0.5
+    assert judged.to_wall > 0.35  # how it tumbles decides: 0.39 to 0.68 with 70 other moments and seeds
 
 
 @pytest.mark.parametrize("dead", [2.0, 4.7, 8.0])
