@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from cfplan.air.background import Check, background_checks
 from cfplan.errors import CfplanError, InfeasibleError
+from cfplan.flight.setpoints.byte_check import check_bytes, check_setpoints
 from cfplan.flight.setpoints.commitment import left_of
-from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, check_setpoints, encode_trajectory
+from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import encode_certified_stops

@@ -25,9 +25,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE, controller_attitude
+from cfplan.flight.setpoints.encoding import RATE, controller_attitude
 from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, excess_of, motion_extremes
-from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, positions_of
+from cfplan.flight.setpoints.packets import (
+    ATTITUDE_QUANTUM,
+    FULL_STATE_TYPE,
+    PAYLOAD_SIZE,
+    FullStateSetpoints,
+    decode,
+    positions_of,
+)
 from cfplan.flight.setpoints.rate_trade import turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside

@@ -18,6 +18,8 @@ from cfplan.machine_code import njit
 
 CRTP_PORT = 7
 FULL_STATE_TYPE = 6
+HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
+ATTITUDE_QUANTUM = math.radians(0.25)  # the largest angle by which compressing turns a quaternion
 LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad/s
 
 _WIRE_OF_ONE = Struct("<B9hI3h")
@@ -39,6 +41,11 @@ class FullStateSetpoints:
     body_rate: NDArray  # (N, 3) rad/s, body axes
 
 
+def arrays_of(setpoints: FullStateSetpoints) -> tuple[NDArray, ...]:
+    """Return the fields in their order, as arrays of one type for compiled code."""
+    return tuple(np.array(getattr(setpoints, name), dtype=float, order="C") for name in FullStateSetpoints.__slots__)
+
+
 def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
     """Return the payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit.
 
@@ -46,10 +53,9 @@ def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
     """
     compressed = compress_quaternion(setpoints.quaternion, first)
     payloads = np.empty((len(compressed), PAYLOAD_SIZE), dtype=np.uint8)
-    position, velocity, acceleration, rate = values = [
-        np.array(getattr(setpoints, name), dtype=float, order="C") for name in _IN_MILLI
-    ]
-    bad, field = _packed(payloads, (position, velocity, acceleration, rate), compressed)
+    position, velocity, acceleration, _, rate = arrays_of(setpoints)
+    values = position, velocity, acceleration, rate
+    bad, field = _packed(payloads, values, compressed)
     if bad >= 0:
         raise NotCertifiedError(
             f"{_IN_MILLI[field]} {values[field][bad]} does not fit a packet (at most {LARGEST})",

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import check_motion, encode_motion
+from cfplan.flight.setpoints.byte_check import check_motion
+from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
 from cfplan.flight.setpoints.stops import DURATION, chunks, stop_motion

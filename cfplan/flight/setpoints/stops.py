@@ -17,7 +17,7 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import (
-    LEADING_SHARE,
+    LEADING_WEIGHT,
     RATE_LEAD,
     THRUST_LEAD,
     command_quaternion,
@@ -161,7 +161,7 @@ def _stop_rows(
         for m in range(length):
             for i in range(3):
                 later, before = _between(turning, m + leads[0], i), _between(turning, m - leads[0], i)
-                rates[k, m, i] = LEADING_SHARE * later + (1.0 - LEADING_SHARE) * before
+                rates[k, m, i] = LEADING_WEIGHT * later + (1.0 - LEADING_WEIGHT) * before
             place = min(m + leads[1], length - 1.0)
             row = int(place)
             after, between = min(row + 1, length - 1), place - row

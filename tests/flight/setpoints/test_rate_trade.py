@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import (
     LEAN_MAX,
