@@ -1,17 +1,18 @@
 """Byte check: certifies that the bytes of setpoints make the vehicle fly what was planned, and within the limits.
 
 It begins with the decoded bytes and the trajectory, which is evaluated afresh, and uses no number that encoding
-computed. Where encoding goes from setpoint to setpoint in compiled code, by quaternions, this goes from formula to
-formula over all setpoints, by matrices.
+computed. Where encoding turns attitudes by quaternions, this multiplies matrices; it shares with encoding only the
+controller's attitude, the push off obstacles, and the rates that hold the body against the air.
 
 For the names in formulas see rate_trade.py. With R the matrix of the attitude to fly, the wanted attitude is
-R exp(-τ ω) exp(φ); the controller must make it from the bytes, with the thrust of the motion along R's axis z.
+W = R exp(-τ ω) exp(φ); the controller must make it from the bytes, with the thrust of the motion along R's axis z.
 """
 
 import math
 from dataclasses import replace
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
@@ -19,17 +20,19 @@ from cfplan.flight.setpoints.encoding import (
     LEAD,
     THRUST_LEAD,
     EncodedFlight,
-    command_quaternion,
-    controller_attitude,
+    attitude_rows,
     lead_rates,
+    sent_rows,
 )
 from cfplan.flight.setpoints.level_out import (
     BRAKE_LEAD,
     SPEED_GAINED,
     SPEED_LEFT,
     WALL_LEAD,
+    Faces,
+    LevelOut,
     faces_of,
-    pushes_off_obstacles,
+    push_off_obstacles,
 )
 from cfplan.flight.setpoints.packets import (
     ATTITUDE_QUANTUM,
@@ -37,6 +40,7 @@ from cfplan.flight.setpoints.packets import (
     HALF_QUANTUM,
     PAYLOAD_SIZE,
     FullStateSetpoints,
+    arrays_of,
     decode,
 )
 from cfplan.flight.setpoints.rate_trade import (
@@ -47,13 +51,24 @@ from cfplan.flight.setpoints.rate_trade import (
     AttitudeGains,
     held_against_air,
 )
+from cfplan.machine_code import njit
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, AT_MOST, INSTANT
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.measures import extremes_at_instants, measures_at_instants
-from cfplan.vehicle.rotations import heading_of, matrix_product, matrix_rows, norms, quaternions_of, turn_rows
+from cfplan.vehicle.rotations import (
+    Matrix,
+    Vector,
+    dot,
+    heading_of,
+    matrix_product,
+    matrix_rows,
+    norms,
+    transpose,
+    turn_rows,
+)
 from cfplan.vehicle.trajectory import Trajectory
 
 _ROUNDING = 1e-9
@@ -61,6 +76,17 @@ _ROUNDED = HALF_QUANTUM + _ROUNDING
 _LEAN_MAX = math.radians(75.0)  # the controller's heading is not defined at a tilt of 90°
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
 _TINY = 1e-12  # in place of lengths of 0
+
+# What the errors of setpoints are called, in the order in which they are judged, and the most that each may be.
+_ERRORS = (
+    ("position in the packet is not that of the trajectory, off by", _ROUNDED),
+    ("velocity in the packet is not that of the trajectory, off by", _ROUNDED),
+    ("body_rate in the packet is not that of the trajectory, off by", _ROUNDED),
+    ("acceleration in the packet is not that of the trajectory, off by", _ROUNDED),
+    ("quaternion in the packet is not that of the trajectory, off by rad", ATTITUDE_QUANTUM),
+    ("the thrust that is sent leans too far, by rad", _LEAN_MAX),
+    ("the controller would not make the planned torque, off by rad", ATTITUDE_QUANTUM),
+)
 
 
 def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: PlanLimits) -> None:
@@ -122,39 +148,62 @@ def check_motion(
     which it keeps. `acceleration_ahead` is that of encode_motion(). Raises NotCertifiedError with the number of the
     setpoint at fault, counted from `first`.
     """
-    _require(
-        first, "the payload is no full state: its type is off by", np.abs(payloads[:, 0] - float(FULL_STATE_TYPE)), 0.0
-    )
+    others = np.flatnonzero(payloads[:, 0] != FULL_STATE_TYPE)
+    if len(others):
+        raise _refused("the payload is no full state", payloads[others[0], 0], first + int(others[0]))
     sent, asked = decode(payloads), held_against_air(motion, gains)
-    rate, force = asked.body_rate, (sent.acceleration + _GRAVITY).T
-    attitude = matrix_rows(asked.quaternion.T, 2.0)
-    back = _turn_back(rate)
-    turn = matrix_product(back, _turn_for((rate - sent.body_rate)[:, :2], gains))
-    wanted = np.array(matrix_product(attitude, turn))  # (3, 3, N), as `believed`
-    believed = np.array(matrix_product(attitude, back))
-    cosine, length = turn[2][2], np.sqrt(np.einsum("in,in->n", force, force))
-    made = np.moveaxis(controller_attitude(force.T, sent.quaternion), 0, 2)
-    to_send = command_quaternion(quaternions_of(np.ascontiguousarray(np.moveaxis(wanted, 2, 0))))
+    harmless = harmless_rates(asked, acceleration_ahead, gains, space)
+    errors, acceleration, rate = _compared(arrays_of(sent), arrays_of(asked), harmless, gains.full_rate)
+    for (what, most), error in zip(_ERRORS, errors, strict=True):
+        if not error.max() <= most:  # NaN is an error too
+            row = int((~(error <= most)).argmax())
+            raise _refused(what, float(error[row]), first + row)
+    made = replace(sent, acceleration=acceleration, quaternion=asked.quaternion, body_rate=rate)
+    return held_against_air(made, gains, -1.0)
 
-    off = "{} in the packet is not that of the trajectory, off by".format
-    harmless = np.column_stack([harmless_rates(asked, acceleration_ahead, gains, space), rate[:, 2]])
-    thrust = norms(asked.acceleration + _GRAVITY) / cosine
-    lean = np.arccos(force[2] / length)
-    # The controller makes its attitude of thrust and yaw, and an error of the quaternion turns yaw 1/cos(lean) as far.
-    misses = _angle(np.sqrt(np.einsum("ijn,ijn->n", made - wanted, made - wanted) / 8.0)) * np.cos(lean)
-    _require(first, off("position"), _error(sent.position, asked.position), _ROUNDED)
-    _require(first, off("velocity"), _error(sent.velocity, asked.velocity), _ROUNDED)
-    _require(first, off("body_rate"), _error(sent.body_rate, harmless), _ROUNDED)
-    _require(first, off("acceleration"), _error(force.T, (thrust * wanted[:, 2]).T), _ROUNDED)
-    _require(first, off("quaternion") + " rad", _angle_between(sent.quaternion, to_send), ATTITUDE_QUANTUM)
-    _require(first, "the thrust that is sent leans too far, by rad", lean, _LEAN_MAX)
-    _require(first, "the controller would not make the planned torque, off by rad", misses, ATTITUDE_QUANTUM)
 
-    flown = np.einsum("ijn,jn->ni", np.array(attitude), np.einsum("ijn,in->jn", wanted, force) * cosine)
-    x, y, _ = gains.full_rate * np.einsum("ijn,in->jn", believed, force / length)
-    made_rate = np.column_stack([sent.body_rate[:, 0] - y, sent.body_rate[:, 1] + x, sent.body_rate[:, 2]])
-    asked = replace(sent, acceleration=flown - _GRAVITY, quaternion=asked.quaternion, body_rate=made_rate)
-    return held_against_air(asked, gains, -1.0)
+@njit(error_model="numpy")
+def _compared(
+    sent: tuple[NDArray, ...], asked: tuple[NDArray, ...], harmless: NDArray, full_rate: float
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the errors of setpoints, (len(_ERRORS), N), and the motion that they make.
+
+    `sent` are the fields of setpoints as decoded, `asked` those of the motion with the rates to ask for, `harmless` the
+    roll and pitch rates to send, (N, 2) rad/s. Of the motion made, returns acceleration and body rate, (N, 3) each.
+    """
+    position, velocity, acceleration, quaternion, body_rate = sent
+    errors, accelerations, rates = np.empty((7, len(position))), np.empty_like(acceleration), body_rate.copy()
+    for n in range(len(position)):
+        attitude = matrix_rows(asked[3][n], 2.0)
+        x, y, z = asked[4][n, 0], asked[4][n, 1], asked[4][n, 2]
+        back = _turn_back(x, y)
+        turn = matrix_product(back, _turn_for(x - body_rate[n, 0], y - body_rate[n, 1], full_rate))
+        wanted, believed = matrix_product(attitude, turn), transpose(matrix_product(attitude, back))
+
+        cosine = turn[2][2]  # of the angle between thrust as flown and as sent
+        force = acceleration[n, 0], acceleration[n, 1], acceleration[n, 2] + GRAVITY
+        flown = asked[2][n, 0], asked[2][n, 1], asked[2][n, 2] + GRAVITY
+        thrust, length = math.sqrt(dot(flown, flown)) / cosine, math.sqrt(dot(force, force))
+        lean = math.acos(force[2] / length)
+        made = attitude_rows(force, heading_of(quaternion[n]))
+        off_z = thrust * wanted[0][2], thrust * wanted[1][2], thrust * wanted[2][2]
+        errors[0, n] = _off(_row(position, n), _row(asked[0], n))
+        errors[1, n] = _off(_row(velocity, n), _row(asked[1], n))
+        errors[2, n] = _off(_row(body_rate, n), (harmless[n, 0], harmless[n, 1], z))
+        errors[3, n] = _off(force, off_z)
+        errors[4, n] = _angle(matrix_rows(quaternion[n], 2.0), sent_rows(wanted))
+        errors[5, n] = lean
+        # The controller makes its attitude of thrust and yaw; an error of the quaternion turns yaw 1/cos(lean) as far.
+        errors[6, n] = _angle(made, wanted) * math.cos(lean)
+
+        # The rates that the setpoint asks for at the attitude that the controller believes in the motion.
+        rates[n, 0] -= full_rate * dot(believed[1], force) / length
+        rates[n, 1] += full_rate * dot(believed[0], force) / length
+        x, y, z = transpose(wanted)
+        along = dot(x, force) * cosine, dot(y, force) * cosine, dot(z, force) * cosine
+        accelerations[n, 0], accelerations[n, 1] = dot(attitude[0], along), dot(attitude[1], along)
+        accelerations[n, 2] = dot(attitude[2], along) - GRAVITY
+    return errors, accelerations, rates
 
 
 def harmless_rates(
@@ -167,61 +216,92 @@ def harmless_rates(
 
     `motion` has the rates to ask for, see held_against_air().
     """
-    level_out, velocity = gains.level_out, motion.velocity[:, :2]
-    soon = motion.position + WALL_LEAD * np.column_stack([velocity, np.zeros(len(velocity))])
-    pull = pushes_off_obstacles(soon, faces_of(space).prisms, level_out)
-    for distance, sign in () if space is None else ((soon - space.low, 1.0), (space.high - soon, -1.0)):
-        nearer = np.maximum(level_out.wall_reach - distance[:, :2], 0.0)
-        pull += sign * np.minimum(level_out.wall_stiffness * nearer, level_out.wall_pull_max)
-    pull -= level_out.braking * (SPEED_LEFT * velocity + SPEED_GAINED * acceleration_ahead[:, :2])
-
-    (x, y), size = heading_of(motion.quaternion.T), np.maximum(norms(pull), _TINY)
-    forward, left = np.array([x * pull[:, 0] + y * pull[:, 1], x * pull[:, 1] - y * pull[:, 0]]) / np.hypot(x, y) / size
-    helpful = np.minimum(gains.full_rate * np.sin(np.arctan(size / GRAVITY)), level_out.rate_max)
-    excess = motion.body_rate[:, :2] - (helpful * np.array([-left, forward])).T
-    size = np.maximum(norms(excess), _TINY)
-
-    up = matrix_product(matrix_rows(motion.quaternion.T, 2.0), _turn_back(motion.body_rate))[2]  # in axes believed
-    across = (up[0] * excess[:, 1] - up[1] * excess[:, 0]) / size
-    reached = np.maximum(np.hypot(across, up[2]), LEAST_LIFT)
-    widest = np.clip(np.arctan2(across, up[2]) + np.arccos(LEAST_LIFT / reached), 0.0, math.pi / 2)
-    traded = np.minimum(np.minimum(size, TRADED_RATE_MAX), gains.full_rate * np.sin(widest))
-    return np.asarray(motion.body_rate[:, :2] - excess * (traded / size)[:, None])
+    ahead = np.array(acceleration_ahead, dtype=float, order="C")
+    return _harmless(arrays_of(motion), ahead, faces_of(space), gains.level_out, gains.full_rate)
 
 
-def _turn_back(rate: NDArray):
-    """Return the matrix, rows of components (N,), of the turn exp(-τ ω), about x and y, by rates (N, 3), rad/s."""
-    x, y = -ATTITUDE_AGE * rate[:, :2].T
-    angle = np.hypot(x, y) / math.pi
-    return turn_rows(x, y, np.sinc(angle), 0.5 * np.sinc(0.5 * angle) ** 2)
+@njit(error_model="numpy")
+def _harmless(
+    motion: tuple[NDArray, ...], ahead: NDArray, faces: Faces, level_out: LevelOut, full_rate: float
+) -> NDArray:
+    """Return the result of harmless_rates()."""
+    position, velocity, _, quaternion, body_rate = motion
+    out = np.empty((len(position), 2))
+    for n in range(len(position)):
+        pull_x, pull_y = _pull(position[n], velocity[n], ahead[n], faces, level_out)
+        x, y = heading_of(quaternion[n])
+        size, across = max(math.sqrt(pull_x * pull_x + pull_y * pull_y), _TINY), math.sqrt(x * x + y * y)
+        forward, left = (x * pull_x + y * pull_y) / (across * size), (x * pull_y - y * pull_x) / (across * size)
+        helpful = min(full_rate * math.sin(math.atan(size / GRAVITY)), level_out.rate_max)
+        wx, wy = body_rate[n, 0], body_rate[n, 1]
+        excess_x, excess_y = wx + helpful * left, wy - helpful * forward
+
+        size = max(math.sqrt(excess_x * excess_x + excess_y * excess_y), _TINY)
+        up = matrix_product(matrix_rows(quaternion[n], 2.0), _turn_back(wx, wy))[2]  # in the axes believed
+        across = (up[0] * excess_y - up[1] * excess_x) / size
+        traded = min(size, TRADED_RATE_MAX)
+        sine = traded / full_rate  # of the turn that replaces it
+        if not across * sine + up[2] * math.sqrt(1.0 - sine * sine) >= LEAST_LIFT:  # else it does not lean too far
+            reached = max(math.sqrt(across * across + up[2] * up[2]), LEAST_LIFT)
+            widest = min(max(math.atan2(across, up[2]) + math.acos(LEAST_LIFT / reached), 0.0), 0.5 * math.pi)
+            traded = min(traded, full_rate * math.sin(widest))
+        traded /= size
+        out[n, 0], out[n, 1] = wx - traded * excess_x, wy - traded * excess_y
+    return out
 
 
-def _turn_for(rate: NDArray, gains: AttitudeGains):
-    """Return the matrix likewise of the turn exp(φ) that replaces rates, (N, 2) rad/s."""
-    size = norms(rate)
-    scale = 1.0 / np.maximum(size, gains.full_rate)  # the turn has the sine |Δ| kw / 2kR, 1 at most
-    cosine = np.sqrt(1.0 - np.minimum(scale * size, 1.0) ** 2)
-    return turn_rows(rate[:, 0], rate[:, 1], scale, scale**2 / (1.0 + cosine))
+@register_jitable
+def _pull(place: NDArray, velocity: NDArray, ahead: NDArray, faces: Faces, level_out: LevelOut) -> tuple[float, float]:
+    """Return the horizontal acceleration, m/s², that level-out should give after a setpoint."""
+    x, y = place[0] + WALL_LEAD * velocity[0], place[1] + WALL_LEAD * velocity[1]
+    off_x, off_y = push_off_obstacles(x, y, place[2], faces.prisms, level_out)
+    reach, stiffness, most = level_out.wall_reach, level_out.wall_stiffness, level_out.wall_pull_max
+    off_x += min(stiffness * max(reach - (x - faces.low[0]), 0.0), most)
+    off_x -= min(stiffness * max(reach - (faces.high[0] - x), 0.0), most)
+    off_y += min(stiffness * max(reach - (y - faces.low[1]), 0.0), most)
+    off_y -= min(stiffness * max(reach - (faces.high[1] - y), 0.0), most)
+    left_x = SPEED_LEFT * velocity[0] + SPEED_GAINED * ahead[0]
+    left_y = SPEED_LEFT * velocity[1] + SPEED_GAINED * ahead[1]
+    return off_x - level_out.braking * left_x, off_y - level_out.braking * left_y
 
 
-def _error(sent: NDArray, planned: NDArray) -> NDArray:
-    """Return the largest error of the components, (N,); NaN where one is NaN."""
-    return np.asarray(np.abs(sent - planned).max(axis=1))
+@register_jitable
+def _turn_back(x: float, y: float) -> Matrix:
+    """Return the matrix of the turn exp(-τ ω) by roll and pitch rates, rad/s."""
+    angle = max(ATTITUDE_AGE * math.sqrt(x * x + y * y), _TINY)
+    half = math.sin(0.5 * angle) / angle
+    return turn_rows(-ATTITUDE_AGE * x, -ATTITUDE_AGE * y, math.sin(angle) / angle, 2.0 * half * half)
 
 
-def _angle(sine_of_half: NDArray) -> NDArray:
-    return np.asarray(2.0 * np.arcsin(np.minimum(sine_of_half, 1.0)))
+@register_jitable
+def _turn_for(x: float, y: float, full_rate: float) -> Matrix:
+    """Return the matrix of the turn exp(φ) that replaces roll and pitch rates, rad/s."""
+    size = math.sqrt(x * x + y * y)
+    scale = 1.0 / max(size, full_rate)  # the turn has the sine |Δ| kw / 2kR, 1 at most
+    cosine = math.sqrt(1.0 - min(scale * size, 1.0) ** 2)
+    return turn_rows(x, y, scale, scale * scale / (1.0 + cosine))
 
 
-def _angle_between(first: NDArray, second: NDArray) -> NDArray:
-    """Return the angles, (N,) rad, between unit quaternions, (N, 4)."""
-    return np.asarray(2.0 * np.arccos(np.minimum(np.abs(np.einsum("ni,ni->n", first, second)), 1.0)))
+@register_jitable
+def _row(values: NDArray, n: int) -> Vector:
+    return values[n, 0], values[n, 1], values[n, 2]
 
 
-def _require(first: int, what: str, value: NDArray, most: float) -> None:
-    """Raise NotCertifiedError at the first setpoint whose value, (N,), is more than `most`, or NaN."""
-    if (wrong := ~(value <= most)).any():
-        raise _refused(what, float(value[wrong.argmax()]), first + int(wrong.argmax()))
+@register_jitable
+def _off(first: Vector, second: Vector) -> float:
+    """Return the largest difference of a component; NaN if one is NaN."""
+    off_y = np.maximum(abs(first[1] - second[1]), abs(first[2] - second[2]))
+    return np.maximum(abs(first[0] - second[0]), off_y)
+
+
+@register_jitable
+def _angle(first: Matrix, second: Matrix) -> float:
+    """Return the angle, rad, between rotations: ‖A - B‖² = 8 sin²(angle / 2)."""
+    total = 0.0
+    for a, b in zip(first, second):  # noqa: B905, as numba knows no strict zip
+        x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
+        total += x * x + y * y + z * z
+    return 2.0 * math.asin(min(math.sqrt(total / 8.0), 1.0))
 
 
 def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: PlanLimits) -> None:

@@ -160,18 +160,12 @@ def controller_attitude(thrust: NDArray, quaternion: NDArray) -> NDArray:
 
 @njit(error_model="numpy")
 def _commands(quaternions: NDArray) -> NDArray:
-    """Return the result of command_quaternion(): z as planned, x above [cos yaw, sin yaw]."""
+    """Return the result of command_quaternion()."""
     out = np.empty((len(quaternions), 4))
     for n in range(len(quaternions)):
         x, y, z, w = quaternions[n]
         frame = matrix_rows((x, y, z, w), 2.0 / (x * x + y * y + z * z + w * w))
-        a, b, c = frame[0][2], frame[1][2], frame[2][2]
-        cos, sin = direction(frame[1][1], -frame[0][1])  # of yaw
-        rise = -(cos * a + sin * b) / c
-        norm = math.sqrt(1.0 + rise * rise)
-        p, q, r = cos / norm, sin / norm, rise / norm
-        turned = quaternion_of(((p, b * r - c * q, a), (q, c * p - a * r, b), (r, a * q - b * p, c)))
-        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = turned
+        out[n, 0], out[n, 1], out[n, 2], out[n, 3] = quaternion_of(sent_rows(frame))
     return out
 
 
@@ -180,7 +174,7 @@ def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
     """Return the result of controller_attitude()."""
     out = np.empty((len(thrusts), 3, 3))
     for n in range(len(thrusts)):
-        rows = _attitude_rows((thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]), heading_of(quaternions[n]))
+        rows = attitude_rows((thrusts[n, 0], thrusts[n, 1], thrusts[n, 2]), heading_of(quaternions[n]))
         out[n, 0, 0], out[n, 0, 1], out[n, 0, 2] = rows[0]
         out[n, 1, 0], out[n, 1, 1], out[n, 1, 2] = rows[1]
         out[n, 2, 0], out[n, 2, 1], out[n, 2, 2] = rows[2]
@@ -188,7 +182,18 @@ def _attitudes(thrusts: NDArray, quaternions: NDArray) -> NDArray:
 
 
 @register_jitable
-def _attitude_rows(thrust: Vector, heading: tuple[float, float]) -> Matrix:
+def sent_rows(attitude: Matrix) -> Matrix:
+    """Return the attitude to send for one to be made by the controller: the same z, and x above [cos yaw, sin yaw]."""
+    a, b, c = attitude[0][2], attitude[1][2], attitude[2][2]
+    cos, sin = direction(attitude[1][1], -attitude[0][1])  # of yaw
+    rise = -(cos * a + sin * b) / c
+    norm = math.sqrt(1.0 + rise * rise)
+    p, q, r = cos / norm, sin / norm, rise / norm
+    return (p, b * r - c * q, a), (q, c * p - a * r, b), (r, a * q - b * p, c)
+
+
+@register_jitable
+def attitude_rows(thrust: Vector, heading: tuple[float, float]) -> Matrix:
     """Return the controller's attitude: z along the thrust, y along z × [cos yaw, sin yaw, 0]."""
     cos, sin = direction(heading[0], heading[1])  # of yaw
     a, b, c = thrust

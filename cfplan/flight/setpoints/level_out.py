@@ -19,7 +19,6 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import Quaternion, direction, heading_of
@@ -71,7 +70,7 @@ def pull_of(
     `place`, m, and `velocity`, m/s, are the setpoint's, (3,); `ahead` is the acceleration BRAKE_LEAD later, m/s².
     """
     x, y = place[0] + WALL_LEAD * velocity[0], place[1] + WALL_LEAD * velocity[1]
-    off_x, off_y = _push_off_obstacles(x, y, place[2], faces.prisms, level_out)
+    off_x, off_y = push_off_obstacles(x, y, place[2], faces.prisms, level_out)
     off_x += _push_off_walls(x, faces.low[0], faces.high[0], level_out)
     off_y += _push_off_walls(y, faces.low[1], faces.high[1], level_out)
     return (
@@ -110,17 +109,8 @@ def _push(distance: float, level_out: LevelOut) -> float:
     return min(level_out.wall_stiffness * max(level_out.wall_reach - distance, 0.0), level_out.wall_pull_max)
 
 
-@njit(error_model="numpy")
-def pushes_off_obstacles(places: NDArray, prisms: NDArray, level_out: LevelOut) -> NDArray:
-    """Return the accelerations, (N, 2) m/s², away from obstacles, (K, 8), at places, (N, 3) m."""
-    out = np.empty((len(places), 2))
-    for n in range(len(places)):
-        out[n, 0], out[n, 1] = _push_off_obstacles(places[n, 0], places[n, 1], places[n, 2], prisms, level_out)
-    return out
-
-
 @register_jitable
-def _push_off_obstacles(x: float, y: float, z: float, prisms: NDArray, level_out: LevelOut) -> tuple[float, float]:
+def push_off_obstacles(x: float, y: float, z: float, prisms: NDArray, level_out: LevelOut) -> tuple[float, float]:
     """Return the acceleration, m/s², away from obstacles; several together push at most as much as one may.
 
     The height of an obstacle above the vehicle adds to its distance; one beneath counts as beside, since the vehicle

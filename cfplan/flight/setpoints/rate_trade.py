@@ -136,7 +136,7 @@ def _traded(
         x, y = body_rate[n, 0], body_rate[n, 1]
         pull = pull_of(position[n], velocity[n], ahead[n], faces, level_out)
         helpful_x, helpful_y = helpful_rate(pull, attitude, full_rate, level_out.rate_max)
-        back = _turn(-ATTITUDE_AGE * x, -ATTITUDE_AGE * y)  # to the attitude that the controller believes
+        back = _turn_back(x, y)
         fraction = _fraction_to_trade(product(attitude, back), x - helpful_x, y - helpful_y, full_rate)
         rates[n, 0] = math.floor((x - fraction * (x - helpful_x)) / _QUANTUM + 0.5) * _QUANTUM
         rates[n, 1] = math.floor((y - fraction * (y - helpful_y)) / _QUANTUM + 0.5) * _QUANTUM
@@ -162,32 +162,38 @@ def _fraction_to_trade(believed: Quaternion, x: float, y: float, full_rate: floa
     a, b, c, d = believed
     across = 2.0 * ((a * c - b * d) * y - (b * c + a * d) * x) / size  # u_n
     lift = 1.0 - 2.0 * (a * a + b * b)  # u_z
+    most = min(size, TRADED_RATE_MAX)
+    sine = most / full_rate  # sin φ
+    if across * sine + lift * math.sqrt(1.0 - sine * sine) >= LEAST_LIFT:  # the usual case, in which no angle is needed
+        return most / size
     reached = math.sqrt(across * across + lift * lift)
     widest = math.atan2(across, lift)
     if reached > LEAST_LIFT:
         widest += math.acos(LEAST_LIFT / reached)
-    most = full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi))
-    return min(1.0, most / size, TRADED_RATE_MAX / size)
+    return min(most, full_rate * math.sin(min(max(widest, 0.0), 0.5 * math.pi))) / size
 
 
 @register_jitable
 def _turn_for(x: float, y: float, full_rate: float) -> Quaternion:
     """Return the turn whose torque is that of roll and pitch rates, rad/s."""
-    size = math.sqrt(x * x + y * y)
-    if size == 0.0:
-        return 0.0, 0.0, 0.0, 1.0
-    scale = math.asin(min(size / full_rate, 1.0)) / size
-    return _turn(scale * x, scale * y)
+    sine = min(math.sqrt(x * x + y * y) / full_rate, 1.0)
+    half = math.sqrt(0.5 + 0.5 * math.sqrt(1.0 - sine * sine))  # the cosine of half of it
+    return _turn(x, y, 0.5 * sine / half, half)
 
 
 @register_jitable
-def _turn(x: float, y: float) -> Quaternion:
-    """Return the quaternion of the rotation vector (x, y, 0), rad."""
-    angle = math.sqrt(x * x + y * y)
-    if angle == 0.0:
-        return 0.0, 0.0, 0.0, 1.0
-    scale = math.sin(0.5 * angle) / angle
-    return scale * x, scale * y, 0.0, math.cos(0.5 * angle)
+def _turn_back(x: float, y: float) -> Quaternion:
+    """Return the turn from the attitude to the one that the controller believes, by roll and pitch rates, rad/s."""
+    half = -0.5 * ATTITUDE_AGE * math.sqrt(x * x + y * y)
+    return _turn(x, y, math.sin(half), math.cos(half))
+
+
+@register_jitable
+def _turn(x: float, y: float, sin_half: float, cos_half: float) -> Quaternion:
+    """Return the quaternion of a turn about (x, y, 0), by sine and cosine of half its angle."""
+    size = math.sqrt(x * x + y * y)
+    scale = sin_half / size if size > 0.0 else 0.0
+    return scale * x, scale * y, 0.0, cos_half
 
 
 def turns_for(rate: NDArray, gains: AttitudeGains = FIRMWARE_GAINS) -> NDArray:

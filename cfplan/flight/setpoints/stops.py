@@ -32,7 +32,7 @@ from cfplan.vehicle.rotations import write_quaternion, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
-_CHUNK = 200  # stops at a time, so that all fields of them stay in a processor's cache
+_CHUNK = 64  # stops at a time, so that all fields of them stay in a processor's cache
 
 
 def encode_stops(
