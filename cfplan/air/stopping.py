@@ -82,7 +82,7 @@ def _stop_along(
     motion, gains, space = encoded.motion, encoded.gains, encoded.space
     first, second = np.array([0]), np.array([1])
     stop = encode_stops(motion, RATE, duration, second, gains, space)
-    certify_stops(stop, motion, limits, RATE, second, gains, space).require(limits)
+    certify_stops(stop, motion, limits, RATE, rows=second, gains=gains, space=space).require(limits)
     rows, rest = stop[0], stop[0, -1:]
     hovering = np.repeat(rest, round(HOLD * RATE), axis=0)
     payloads = np.concatenate([encoded.payloads[:1], rows, hovering])

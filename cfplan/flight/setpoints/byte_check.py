@@ -137,27 +137,25 @@ def check_motion(
     motion: FullStateSetpoints,
     acceleration_ahead: NDArray,
     gains: AttitudeGains,
-    first: int = 0,
-    *,
     space: Space | None = None,
 ) -> FullStateSetpoints:
     """Check that payloads, (N, 29) uint8, make the vehicle fly this motion; return the motion that they make.
 
     The motion returned has the position and velocity of the bytes, the thrust along the attitude at which the
     controller's torque is that of the motion's rates, and the rates that the bytes ask for at the motion's attitude,
-    which it keeps. `acceleration_ahead` is that of encode_motion(). Raises NotCertifiedError with the number of the
-    setpoint at fault, counted from `first`.
+    which it keeps. `acceleration_ahead` is that of encode_motion(). Raises NotCertifiedError with the setpoint at
+    fault.
     """
     others = np.flatnonzero(payloads[:, 0] != FULL_STATE_TYPE)
     if len(others):
-        raise _refused("the payload is no full state", payloads[others[0], 0], first + int(others[0]))
+        raise _refused("the payload is no full state", payloads[others[0], 0], int(others[0]))
     sent, asked = decode(payloads), held_against_air(motion, gains)
     harmless = harmless_rates(asked, acceleration_ahead, gains, space)
     errors, acceleration, rate = _compared(arrays_of(sent), arrays_of(asked), harmless, gains.full_rate)
     for (what, most), error in zip(_ERRORS, errors, strict=True):
         if not error.max() <= most:  # NaN is an error too
             row = int((~(error <= most)).argmax())
-            raise _refused(what, float(error[row]), first + row)
+            raise _refused(what, float(error[row]), row)
     made = replace(sent, acceleration=acceleration, quaternion=asked.quaternion, body_rate=rate)
     return held_against_air(made, gains, -1.0)
 

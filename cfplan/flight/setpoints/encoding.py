@@ -135,17 +135,16 @@ def encode_motion(
     motion: FullStateSetpoints,
     acceleration_ahead: NDArray,
     gains: AttitudeGains = FIRMWARE_GAINS,
-    first: int = 0,
     *,
     space: Space | None = None,
 ) -> NDArray:
     """Return the payloads, (N, 29) uint8, that make the vehicle fly a motion and are harmless when they stop.
 
-    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later; `first` is the number of the first
-    setpoint, for the error's text. Raises NotCertifiedError where a value is not finite or does not fit.
+    `acceleration_ahead`, (N, 3) m/s², is that of the motion BRAKE_LEAD later. Raises NotCertifiedError where a value is
+    not finite or does not fit.
     """
     sent = trade_rates(motion, acceleration_ahead, gains, space)
-    return encode(replace(sent, quaternion=command_quaternion(sent.quaternion)), first)
+    return encode(replace(sent, quaternion=command_quaternion(sent.quaternion)))
 
 
 def command_quaternion(quaternion: NDArray) -> NDArray:
