@@ -27,9 +27,7 @@ from cfplan.safety.limits import Limits
 
 LOWER_SPEEDS = (1.2, 0.7)  # m/s, tried in order if the flight would end badly at full speed
 JOINT_DELAYS = (0, 5, 15, 35)  # setpoints by which the joint is delayed, tried in order
-SLOWDOWN_MARGIN = (
-    3  # setpoints by which a plan that slows down begins later than the splice: planning the next part took time
-)
+SLOWDOWN_MARGIN = 3  # setpoints after the splice at which a slower plan begins, as planning the next part took time
 SPEED_STEP = 0.75  # factor by which a request lowers the speed; a request to fly faster undoes it
 
 
