@@ -166,7 +166,7 @@ def _certified(
     limits: Limits,
     starts: NDArray | None,
     check: Callable[[], None],
-    *,
+    *,  # for a beginning only
     motion: FullStateSetpoints | None = None,
     foreseen: Sequence[Check] = (),
 ) -> tuple[NDArray, LinkLossMoments]:

@@ -69,7 +69,7 @@ def descent(
     pace: Pace,
     floor: float,
     lowest: float,
-    *,
+    *,  # beside the motion itself: what it is flown by
     limits: Limits,
     rate: float,
     aside: tuple[float, float] = (0.0, 0.0),

@@ -59,7 +59,7 @@ def certify_stops(
     motion: FullStateSetpoints,
     limits: Limits,
     rate: float,
-    *,
+    *,  # as for encode_stops()
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
