@@ -9,7 +9,6 @@ __all__ = [
     "joint",
     "measures",
     "motor_commands",
-    "panels",
     "profile",
     "profile_spline",
     "rotations",
