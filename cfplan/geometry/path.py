@@ -15,8 +15,10 @@ from cfplan.numbers import coordinates
 ORDERS = 5  # γ and four derivatives
 STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
 _SAMPLES = 32  # per piece, where a path is searched for stops
-_Vector = tuple[float, float, float]
-_GOLDEN, _GOLDEN_STEPS = (math.sqrt(5) - 1) / 2, 45
+_Derivatives = tuple[float, float, float, float, float]
+_FACTORIALS = (1.0, 1.0, 2.0, 6.0, 24.0)
+_LANES = 64
+_ZOOMS = 6  # each to an interval a fifteenth as long
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
@@ -92,11 +94,9 @@ class Path:
         s = np.array(s, dtype=float)
         return np.ascontiguousarray(self.derivatives(s.ravel())[order].T).reshape(*s.shape, 3)
 
-    def derivatives(self, s: NDArray, piece: NDArray | None = None) -> NDArray:
-        """Return γ and its first four derivatives at s, (N,), by the polynomials of `piece` where given, (5, 3, N)."""
-        s = np.clip(s, 0.0, self.breaks[-1])
-        piece = intervals_of(self.breaks, s) if piece is None else piece
-        return _derivatives(self.origins, self.coefficients, s, piece)
+    def derivatives(self, s: NDArray) -> NDArray:
+        """Return γ and its first four derivatives at s, (N,), as (5, 3, N)."""
+        return curve_at(self.breaks, self.coefficients, np.asarray(s, dtype=float))
 
     def part(self, low: float, high: float) -> "Path":
         """Return the path from s = low to s = high, in two pieces or more so that rest ends stay exact."""
@@ -146,11 +146,12 @@ class Path:
             self._refuse("the path stops between its ends (a cusp or a reversal)", float(stops[0]), where)
 
     def _slowest(self, low: NDArray, high: NDArray) -> NDArray:
-        """Return the s of the least |γ'| in each interval [low, high], by golden-section search."""
-        for _ in range(_GOLDEN_STEPS):
-            left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
-            slower = np.square(self(left, 1)).sum(axis=-1) < np.square(self(right, 1)).sum(axis=-1)
-            low, high = np.where(slower, low, left), np.where(slower, right, high)
+        """Return the s of the least |γ'| in each interval [low, high]."""
+        every = np.arange(len(low))
+        for _ in range(_ZOOMS):
+            s = np.linspace(low, high, _SAMPLES)
+            least = np.argmin(np.linalg.norm(self(s, 1), axis=-1), axis=0)
+            low, high = s[np.maximum(least - 1, 0), every], s[np.minimum(least + 1, _SAMPLES - 1), every]
         return np.asarray((low + high) / 2)
 
     def _refuse(self, what: str, s: float, where: str) -> None:
@@ -161,45 +162,75 @@ class Path:
         )
 
 
-def intervals_of(edges: NDArray, values: ArrayLike) -> NDArray:
-    """Return the interval of ascending edges that holds each value; an edge belongs to the interval on its right.
+@njit
+def intervals_of(edges: NDArray, values: NDArray) -> NDArray:
+    """Return the interval of ascending edges, (M+1,), in which each value, (N,), lies; fast where they are in order.
 
-    The first and the last interval hold what lies beyond.
+    An edge belongs to the interval on its right; the first and the last interval hold what lies beyond.
     """
-    return np.searchsorted(edges[1:-1], values, side="right")
+    found, k = np.empty(len(values), np.int64), 0
+    for n in range(len(values)):
+        if not edges[k] <= values[n] < edges[k + 1]:
+            k = np.searchsorted(edges[1:-1], values[n], side="right")
+        found[n] = k
+    return found
 
 
-@register_jitable(forceinline=True, fastmath={"contract"})
-def curve_at(table: NDArray, x: float) -> tuple[_Vector, _Vector, _Vector, _Vector, _Vector]:
-    """Return γ to γ'''' at x from the origin of a piece, from its coefficients, (D, 3)."""
-    a, b, c = _horner(table, 0, x), _horner(table, 1, x), _horner(table, 2, x)
-    return (
-        (a[0], b[0], c[0]),
-        (a[1], b[1], c[1]),
-        (2.0 * a[2], 2.0 * b[2], 2.0 * c[2]),
-        (6.0 * a[3], 6.0 * b[3], 6.0 * c[3]),
-        (24.0 * a[4], 24.0 * b[4], 24.0 * c[4]),
-    )
+@njit
+def curve_at(breaks: NDArray, coefficients: NDArray, s: NDArray) -> NDArray:
+    """Return γ and its first four derivatives, (5, 3, N), at s, (N,), of a path with these breaks and coefficients."""
+    s = np.minimum(np.maximum(s, 0.0), breaks[-1])
+    return curve_on(breaks, coefficients, s, intervals_of(breaks, s))
 
 
-@register_jitable(forceinline=True, fastmath={"contract"})
-def _horner(table: NDArray, axis: int, x: float) -> tuple[float, float, float, float, float]:
-    """Return a coordinate and four derivatives over the factorials of their orders."""
-    p0, p1, p2, p3, p4 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for power in range(len(table) - 1, -1, -1):
-        p0, p1, p2, p3, p4 = x * p0 + table[power, axis], x * p1 + p0, x * p2 + p1, x * p3 + p2, x * p4 + p3
-    return p0, p1, p2, p3, p4
+@njit(fastmath={"contract"}, nogil=True)
+def curve_on(breaks: NDArray, coefficients: NDArray, s: NDArray, piece: NDArray) -> NDArray:
+    """Return the same at s within the path, by the polynomials of a piece for each, (N,).
 
-
-@njit(fastmath={"contract"})
-def _derivatives(origins: NDArray, coefficients: NDArray, s: NDArray, piece: NDArray) -> NDArray:
-    """Return γ to γ'''' at s, (N,), in their pieces, (N,), as (5, 3, N)."""
-    out = np.empty((ORDERS, 3, len(s)))
-    for n in range(len(s)):
-        curve = curve_at(coefficients[piece[n]], s[n] - origins[piece[n]])
-        for order in range(ORDERS):
-            out[order, 0, n], out[order, 1, n], out[order, 2, n] = curve[order]
+    Consecutive points of one piece are taken together, up to _LANES of them. Their rows are those of an array whose
+    size the compiler knows, so that it can work on several points with one instruction.
+    """
+    out, rows, begin = np.empty((ORDERS, 3, len(s))), np.empty((ORDERS + 1, _LANES)), 0
+    while begin < len(s):
+        k, count = piece[begin], 1
+        while count < _LANES and begin + count < len(s) and piece[begin + count] == k:
+            count += 1
+        origin = breaks[-1] if k == len(coefficients) - 1 else breaks[k]
+        for n in range(count):
+            rows[ORDERS, n] = s[begin + n] - origin
+        for axis in range(3):
+            _horner(rows, coefficients[k, :, axis], min(count, _LANES))
+            for order in range(ORDERS):
+                to = out[order, axis, begin : begin + count]
+                for n in range(len(to)):
+                    to[n] = _FACTORIALS[order] * rows[order, n]
+        begin += count
     return out
+
+
+@register_jitable(forceinline=True, fastmath={"contract"})
+def _horner(rows: NDArray, coefficients: NDArray, count: int) -> None:
+    """Write a polynomial and four derivatives over the factorials of their orders; x are in the last of the rows."""
+    for order in range(ORDERS):
+        for n in range(count):
+            rows[order, n] = 0.0
+    for k in range((len(coefficients) - 1) // 4 * 4, -1, -4):  # four coefficients at a time, which spares memory
+        a, b = coefficients[k], _or_zero(coefficients, k + 1)
+        c, d = _or_zero(coefficients, k + 2), _or_zero(coefficients, k + 3)
+        for n in range(count):
+            x, p = rows[ORDERS, n], (rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n])
+            p = _step(x, a, _step(x, b, _step(x, c, _step(x, d, p))))
+            rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n] = p
+
+
+@register_jitable(forceinline=True, fastmath={"contract"})
+def _step(x: float, coefficient: float, p: _Derivatives) -> _Derivatives:
+    return x * p[0] + coefficient, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
+
+
+@register_jitable(forceinline=True)
+def _or_zero(coefficients: NDArray, power: int) -> float:
+    return coefficients[power] if power < len(coefficients) else 0.0
 
 
 def rotation_about_z(yaw: float) -> NDArray:

@@ -146,7 +146,7 @@ def encode_trajectory(
         moments = times[rows] + lead
         states = trajectory.at(moments)
         motion = _led(states, trajectory, moments, rate_lead, thrust_lead)
-        coming = trajectory.acceleration_at(moments + BRAKE_LEAD)
+        coming = trajectory.at(moments + BRAKE_LEAD).acceleration
         payloads.append(encode_motion(motion, coming, gains, rows.start, space=space))
         planned.append(_motion_of(states, states.specific_thrust, states.body_rate))
     sent = np.concatenate(payloads)
@@ -170,7 +170,7 @@ def _led(
     states: FullState, trajectory: Trajectory | JoinedTrajectory, times: NDArray, rate_lead: float, thrust_lead: float
 ) -> FullStateSetpoints:
     """Return the same from the states at those times."""
-    thrust = trajectory.specific_thrust_at(times + thrust_lead) if thrust_lead else states.specific_thrust
+    thrust = trajectory.at(times + thrust_lead).specific_thrust if thrust_lead else states.specific_thrust
     turning = lead_rates(trajectory, times, rate_lead) if rate_lead else states.body_rate
     return _motion_of(states, thrust, turning)
 
@@ -201,7 +201,7 @@ def lead_rates(trajectory: Trajectory | JoinedTrajectory, times: NDArray, rate_l
 
     From the end on they are 0, as the vehicle may be left with any setpoint there.
     """
-    rates = trajectory.body_rate_at(np.concatenate([times + rate_lead, times - rate_lead]))
+    rates = trajectory.at(np.concatenate([times + rate_lead, times - rate_lead])).body_rate
     return _mean_rates(np.array(rates.T, dtype=float, order="C"), times, trajectory.duration)
 
 
@@ -279,7 +279,7 @@ def check_setpoints(
     for rows in _batches(len(payloads)):
         times = encoded.times[rows] + encoded.lead
         planned = trajectory.at(times)
-        thrust = trajectory.specific_thrust_at(times + encoded.thrust_lead)
+        thrust = trajectory.at(times + encoded.thrust_lead).specific_thrust
         motion = FullStateSetpoints(
             position=planned.position,
             velocity=planned.velocity,
@@ -287,7 +287,7 @@ def check_setpoints(
             quaternion=planned.quaternion,
             body_rate=lead_rates(trajectory, times, encoded.rate_lead),
         )
-        coming = trajectory.acceleration_at(times + BRAKE_LEAD)
+        coming = trajectory.at(times + BRAKE_LEAD).acceleration
         flown = check_motion(payloads[rows], motion, coming, encoded.gains, rows.start, space=encoded.space)
         # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
         acceleration = planned.acceleration + flown.acceleration - motion.acceleration
