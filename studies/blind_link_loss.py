@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.errors import CfplanError
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.space import inside
@@ -51,6 +52,9 @@ COLUMNS = (
 )  # fmt: skip
 
 
+REFUSED_COLUMNS = (*COLUMNS[:2], Column("refused", "reason"))
+
+
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path and kind of firmware."""
     kinds = product(settings.path_files, ("yes", "no"))
@@ -59,13 +63,16 @@ def work(settings: Settings, run: Run) -> Work:
 
 
 def measure(case: tuple[Path, str, int, int]) -> dict[str, Any]:
-    """Lose link and poses at some moments of a path's flight. Raises what planning and encoding raise."""
+    """Lose link and poses at some moments of a path's flight, or return why it is not planned or sent."""
     path_file, told, moments, draws = case
     limits = limits_for(path_file)
     if told == "no":
         limits = replace(limits, firmware=replace(limits.firmware, oldest=_WITHOUT_DRAG))
-    planned = plan_flight(path_file, limits)
-    encoded = encode_flight(planned)
+    try:
+        planned = plan_flight(path_file, limits)
+        encoded = encode_flight(planned)
+    except CfplanError as error:
+        return {"path": path_file.stem, "knows_drag": told, "refused": str(error)}
     boxes, flight = link_loss_at_every_setpoint(encoded.payloads, limits), rehearsed_flight(
         encoded, planned.plan.trajectory
     )  # fmt: skip
@@ -98,8 +105,11 @@ def _to_the_floor(way: NDArray, floor: float) -> NDArray:
 
 
 def tables(settings: Settings, rows: list[dict[str, Any]]) -> Iterator[Table]:
-    """Yield a table with one row per path and kind of firmware."""
-    yield table("blind-link-loss", "Link and poses lost, flown on the estimate", COLUMNS, rows)
+    """Yield a table with one row per path and kind of firmware; then the paths that are refused, if there are any."""
+    flown = [row for row in rows if "refused" not in row]
+    yield table("blind-link-loss", "Link and poses lost, flown on the estimate", COLUMNS, flown)
+    if refused := [row for row in rows if "refused" in row]:
+        yield table("refused", "Neither planned nor flown", REFUSED_COLUMNS, refused)
 
 
 STUDY = Study(Settings, work, tables, "flights/*.yaml -o results/blind-link-loss.json")
