@@ -4,20 +4,15 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
-from cfplan.geometry.polynomials import padded, shifted
+from cfplan.geometry.polynomials import ORDERS, derivatives_on, intervals_of, padded, shifted
 from cfplan.machine_code import njit
 from cfplan.numbers import coordinates
 
-ORDERS = 5  # γ and four derivatives
 STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
 _SAMPLES = 32  # per piece, where a path is searched for stops
-_Derivatives = tuple[float, float, float, float, float]
-_FACTORIALS = (1.0, 1.0, 2.0, 6.0, 24.0)
-_LANES = 64
 _ZOOMS = 6  # each to an interval a fifteenth as long
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
@@ -163,74 +158,11 @@ class Path:
 
 
 @njit
-def intervals_of(edges: NDArray, values: NDArray) -> NDArray:
-    """Return the interval of ascending edges, (M+1,), in which each value, (N,), lies; fast where they are in order.
-
-    An edge belongs to the interval on its right; the first and the last interval hold what lies beyond.
-    """
-    found, k = np.empty(len(values), np.int64), 0
-    for n in range(len(values)):
-        if not edges[k] <= values[n] < edges[k + 1]:
-            k = np.searchsorted(edges[1:-1], values[n], side="right")
-        found[n] = k
-    return found
-
-
-@njit
 def curve_at(breaks: NDArray, coefficients: NDArray, s: NDArray) -> NDArray:
     """Return γ and its first four derivatives, (5, 3, N), at s, (N,), of a path with these breaks and coefficients."""
-    s = np.minimum(np.maximum(s, 0.0), breaks[-1])
-    return curve_on(breaks, coefficients, s, intervals_of(breaks, s))
-
-
-@njit(fastmath={"contract"}, nogil=True)
-def curve_on(breaks: NDArray, coefficients: NDArray, s: NDArray, piece: NDArray) -> NDArray:
-    """Return the same at s within the path, by the polynomials of a piece for each, (N,).
-
-    Consecutive points of one piece are taken together, up to _LANES of them. Their rows are those of an array whose
-    size the compiler knows, so that it can work on several points with one instruction.
-    """
-    out, rows, begin = np.empty((ORDERS, 3, len(s))), np.empty((ORDERS + 1, _LANES)), 0
-    while begin < len(s):
-        k, count = piece[begin], 1
-        while count < _LANES and begin + count < len(s) and piece[begin + count] == k:
-            count += 1
-        origin = breaks[-1] if k == len(coefficients) - 1 else breaks[k]
-        for n in range(count):
-            rows[ORDERS, n] = s[begin + n] - origin
-        for axis in range(3):
-            _horner(rows, coefficients[k, :, axis], min(count, _LANES))
-            for order in range(ORDERS):
-                to = out[order, axis, begin : begin + count]
-                for n in range(len(to)):
-                    to[n] = _FACTORIALS[order] * rows[order, n]
-        begin += count
-    return out
-
-
-@register_jitable(forceinline=True, fastmath={"contract"})
-def _horner(rows: NDArray, coefficients: NDArray, count: int) -> None:
-    """Write a polynomial and four derivatives over the factorials of their orders; x are in the last of the rows."""
-    for order in range(ORDERS):
-        for n in range(count):
-            rows[order, n] = 0.0
-    for k in range((len(coefficients) - 1) // 4 * 4, -1, -4):  # four coefficients at a time, which spares memory
-        a, b = coefficients[k], _or_zero(coefficients, k + 1)
-        c, d = _or_zero(coefficients, k + 2), _or_zero(coefficients, k + 3)
-        for n in range(count):
-            x, p = rows[ORDERS, n], (rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n])
-            p = _step(x, a, _step(x, b, _step(x, c, _step(x, d, p))))
-            rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n] = p
-
-
-@register_jitable(forceinline=True, fastmath={"contract"})
-def _step(x: float, coefficient: float, p: _Derivatives) -> _Derivatives:
-    return x * p[0] + coefficient, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
-
-
-@register_jitable(forceinline=True)
-def _or_zero(coefficients: NDArray, power: int) -> float:
-    return coefficients[power] if power < len(coefficients) else 0.0
+    s, origins = np.minimum(np.maximum(s, 0.0), breaks[-1]), breaks[:-1].copy()
+    origins[-1] = breaks[-1]
+    return derivatives_on(origins, coefficients, s, intervals_of(breaks, s))
 
 
 def rotation_about_z(yaw: float) -> NDArray:

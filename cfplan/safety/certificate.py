@@ -18,7 +18,8 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path, curve_on
+from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import derivatives_on
 from cfplan.machine_code import njit
 from cfplan.numbers import shown
 from cfplan.safety.limits import PlanLimits
@@ -141,12 +142,12 @@ def certify(
     segments, (bounds, table) = segments_of(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     path, body, nodes = trajectory.path, compiled_body(trajectory.airframe), trajectory.timing.nodes
-    values, added, places = _search(table, walls, BATCH, body, path.breaks, path.coefficients, nodes, segments)
+    values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
     for _ in range(_TIMES):
         if not any(map(_overstated, bounds, values.tolist(), added.tolist())):
             break
         segments = segments._replace(counts=_NEARER * (segments.counts - 1) + 1)
-        values, added, places = _search(table, walls, BATCH, body, path.breaks, path.coefficients, nodes, segments)
+        values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     margins = [_margin(*each) for each in peaks]
@@ -309,7 +310,7 @@ def _cut(
 
 @njit(error_model="numpy")
 def _search(
-    table: NDArray, walls: NDArray, batch: int, body: Body, breaks: NDArray, coefficients: NDArray, nodes: NDArray,
+    table: NDArray, walls: NDArray, batch: int, body: Body, origins: NDArray, coefficients: NDArray, nodes: NDArray,
     segments: Segments,
 ) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
     """Return the peak of each of the table's quantities, what of it was added to the samples, and s there.
@@ -324,7 +325,7 @@ def _search(
             samples += counts[end]
             end += 1
         s, piece, interval = sampled(segments, begin, end)
-        curve, rows = curve_on(breaks, coefficients, s, piece), np.empty((MEASURES + walls.shape[1], samples))
+        curve, rows = derivatives_on(origins, coefficients, s, piece), np.empty((MEASURES + walls.shape[1], samples))
         fill(rows[:MEASURES], body, curve, nodes, s, interval)
         for axis in range(walls.shape[1]):  # how far from the walls positions are
             middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
-from cfplan.geometry.path import ORDERS
+from cfplan.geometry.polynomials import ORDERS
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import FullState, Trajectory
 

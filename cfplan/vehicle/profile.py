@@ -7,7 +7,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import intervals_of
+from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 from cfplan.vehicle.rotations import Scalar
 

@@ -11,7 +11,7 @@ from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.geometry.path import intervals_of
+from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 

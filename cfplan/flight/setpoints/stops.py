@@ -209,11 +209,3 @@ def _write_turn(out: NDArray, before: NDArray, after: NDArray, rate: float) -> N
     angle = 2.0 * math.atan2(sine, abs(scalar))
     scale = (-angle if scalar < 0.0 else angle) / max(sine, 1e-12) * rate
     out[0], out[1], out[2] = x * scale, y * scale, z * scale
-
-
-def _ahead(values: NDArray, by: float) -> NDArray:
-    """Return (..., M, K): the rows `by` rows later on, or before; the first and the last hold."""
-    place = np.clip(np.arange(values.shape[-2]) + by, 0.0, values.shape[-2] - 1.0)
-    row = place.astype(int)
-    after = np.minimum(row + 1, values.shape[-2] - 1)
-    return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])
