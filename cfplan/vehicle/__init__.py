@@ -9,7 +9,6 @@ __all__ = [
     "measures",
     "motion",
     "motor_commands",
-    "panels",
     "profile",
     "profile_spline",
     "rotations",

@@ -92,7 +92,7 @@ class JoinedTrajectory:
         order = np.argsort(np.concatenate(list(flown.values())))
         merged = {name: np.concatenate([getattr(each, name) for each in states])[order] for name in FullState.__slots__}
         state = FullState(**merged | {"time": flat})
-        return state if times.ndim else state.first()
+        return state if times.ndim else state.rows(0)
 
     def since(self, time: float) -> "JoinedTrajectory":
         """Return the same flight on a clock that is 0 at `time`, s, without what is flown LOOK_BACK before."""

@@ -35,9 +35,9 @@ class FullState:
     thrust_axis: NDArray  # (N, 3) body z in the world
     motor_thrust: NDArray  # (N, 4) N, motors 1 to 4
 
-    def first(self) -> "FullState":
-        """Return the first of the states."""
-        return FullState(*(getattr(self, name)[0] for name in FullState.__slots__))
+    def rows(self, which: int | slice) -> "FullState":
+        """Return one of the states, or some."""
+        return FullState(*(getattr(self, name)[which] for name in FullState.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +86,7 @@ class Trajectory:
         if outside.any():
             rows[:, outside] = self._hover(rows[STATES["yaw"], outside])
         state = state_of(flat, s, curve, rows)
-        return state if times.ndim else state.first()
+        return state if times.ndim else state.rows(0)
 
     def _hover(self, yaw: NDArray) -> NDArray:
         """Return the full states of a level hover at each yaw, (N,) rad, as states_at() has them."""
