@@ -3,11 +3,11 @@
 __all__ = [
     "airframe",
     "airframes",
-    "dense",
     "flatness",
     "hover",
     "joint",
     "measures",
+    "motion",
     "motor_commands",
     "profile",
     "profile_spline",

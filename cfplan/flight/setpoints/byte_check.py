@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import (
     LEAD,
+    LEADING_WEIGHT,
+    RATE_LEAD,
     THRUST_LEAD,
     EncodedFlight,
     attitude_rows,
-    lead_rates,
     sent_rows,
 )
 from cfplan.flight.setpoints.level_out import (
@@ -117,19 +118,30 @@ def check_setpoints(
     """
     times = encoded.times + LEAD
     planned = trajectory.at(times)
-    thrust = trajectory.specific_thrust_at(times + THRUST_LEAD)
+    thrust = trajectory.at(times + THRUST_LEAD).specific_thrust
     motion = FullStateSetpoints(
         position=planned.position,
         velocity=planned.velocity,
         acceleration=thrust[:, None] * planned.thrust_axis - _GRAVITY,
         quaternion=planned.quaternion,
-        body_rate=lead_rates(trajectory, times),
+        body_rate=_lead_rates(trajectory, times),
     )
-    ahead = trajectory.acceleration_at(times + BRAKE_LEAD)
+    ahead = trajectory.at(times + BRAKE_LEAD).acceleration
     flown = check_motion(np.asarray(encoded.payloads), motion, ahead, encoded.gains, space=encoded.space)
     # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
     _check_limits(flown, planned.acceleration + flown.acceleration - motion.acceleration, limits)
     return flown
+
+
+def _lead_rates(trajectory: Trajectory | JoinedTrajectory, times: NDArray) -> NDArray:
+    """Return the body rates that are sent at times (N,), s, (N, 3) rad/s: with what makes up for the motors' lag.
+
+    From the end on they are 0, as the vehicle may be left with any setpoint there.
+    """
+    rates = trajectory.at(np.concatenate([times + RATE_LEAD, times - RATE_LEAD])).body_rate
+    mean = LEADING_WEIGHT * rates[: len(times)] + (1.0 - LEADING_WEIGHT) * rates[len(times) :]
+    mean[times >= trajectory.duration] = 0.0
+    return mean
 
 
 def check_motion(

@@ -93,24 +93,37 @@ def encode_trajectory(
         )
     total = int(np.ceil(trajectory.duration * RATE)) + 1 + int(np.ceil(hold * RATE))
     times = np.arange(total if count is None else min(total, count)) / RATE
-    states = trajectory.at(times + LEAD)
-    ahead = trajectory.acceleration_at(times + LEAD + BRAKE_LEAD)
-    payloads = encode_motion(_led(states, trajectory, times + LEAD), ahead, gains, space=space)
+    states, led, ahead = _sampled(trajectory, times + LEAD)
+    payloads = encode_motion(led, ahead, gains, space=space)
     motion = _motion_of(states, states.specific_thrust, states.body_rate)
     return EncodedFlight(times, payloads, decode(payloads), motion, gains, space)
 
 
 def motion_at(trajectory: Trajectory | JoinedTrajectory, times: NDArray) -> FullStateSetpoints:
-    """Return the motion that setpoints are to make, at times (N,), s: the attitudes and rates to fly.
+    """Return the motion that setpoints are to make, at times (N,), s, of the RATE: the attitudes and rates to fly.
 
     The acceleration is that of the thrust, less gravity: it includes the compensation for drag.
     """
-    return _led(trajectory.at(times), trajectory, times)
+    return _sampled(trajectory, times)[1]
 
 
-def _led(states: FullState, trajectory: Trajectory | JoinedTrajectory, times: NDArray) -> FullStateSetpoints:
-    """Return the same from the states at those times."""
-    return _motion_of(states, trajectory.specific_thrust_at(times + THRUST_LEAD), lead_rates(trajectory, times))
+def _sampled(
+    trajectory: Trajectory | JoinedTrajectory, times: NDArray
+) -> tuple[FullState, FullStateSetpoints, NDArray]:
+    """Return the states at those times, the same motion, and the acceleration BRAKE_LEAD later, (N, 3) m/s².
+
+    The rates before and ahead, and that acceleration, are those of setpoints before and ahead, so the trajectory is
+    evaluated there once. From the end on rates are 0, as the vehicle may be left with any setpoint there.
+    """
+    count, turning, braking = len(times), round(RATE_LEAD * RATE), round(BRAKE_LEAD * RATE)
+    before, beyond = np.arange(-turning, 0) / RATE, np.arange(1, braking + 1) / RATE
+    every = trajectory.at(np.concatenate([times[0] + before, times, times[-1] + beyond]))
+    rates = LEADING_WEIGHT * every.body_rate[2 * turning :][:count]
+    rates += (1.0 - LEADING_WEIGHT) * every.body_rate[:count]
+    rates[times >= trajectory.duration] = 0.0
+    states = every.rows(slice(turning, turning + count))
+    thrust = trajectory.at(times + THRUST_LEAD).specific_thrust
+    return states, _motion_of(states, thrust, rates), every.acceleration[turning + braking :][:count]
 
 
 def _motion_of(states: FullState, thrust: NDArray, body_rate: NDArray) -> FullStateSetpoints:
@@ -118,17 +131,6 @@ def _motion_of(states: FullState, thrust: NDArray, body_rate: NDArray) -> FullSt
     acceleration = thrust[:, None] * states.thrust_axis
     acceleration[:, 2] -= GRAVITY
     return FullStateSetpoints(states.position, states.velocity, acceleration, states.quaternion, body_rate)
-
-
-def lead_rates(trajectory: Trajectory | JoinedTrajectory, times: NDArray) -> NDArray:
-    """Return the body rates to send at times (N,), s, (N, 3) rad/s: with what makes up for the motors' lag.
-
-    From the end on they are 0, as the vehicle may be left with any setpoint there.
-    """
-    rates = trajectory.body_rate_at(np.concatenate([times + RATE_LEAD, times - RATE_LEAD]))
-    mean = LEADING_WEIGHT * rates[: len(times)] + (1.0 - LEADING_WEIGHT) * rates[len(times) :]
-    mean[times >= trajectory.duration] = 0.0
-    return mean
 
 
 def encode_motion(
