@@ -1,6 +1,7 @@
 """`cfplan fly`: plan, certify, rehearse, fly, record."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from cfplan.cli.recorded_flight import Prepared, RecordedFlight
+    from cfplan.preparation.plan_flight import FlightOptions
+    from cfplan.safety.limits import Limits
 
 BUSY = 0.02  # s; setpoints are later than this only if the computer is busy
 
@@ -26,6 +29,7 @@ Examples:
   cfplan fly flights/figure8.yaml --speed 0.3
   cfplan fly flights/figure8.yaml --live --mavlink udp:127.0.0.1:14550
   cfplan fly flights/figure8.yaml --on-board
+  cfplan fly flights/figure8.yaml --after records/<flight>
   printf '1 0 1\\n0 1 1.2\\n' | cfplan fly --waypoints -
 
 Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
@@ -43,6 +47,13 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     "--on-board",
     is_flag=True,
     help="Upload the flight as polynomials for the vehicle's own commander; only poses are streamed.",
+)
+@click.option(
+    "--after",
+    multiple=True,
+    metavar="RECORD",
+    type=click.Path(path_type=Path),
+    help="Correct setpoints by what repeated in earlier flights of this plan; once per record, in order.",
 )
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
@@ -69,6 +80,7 @@ def fly(
     path_or_plan: Path | None,
     lines: str | None,
     on_board: bool,
+    after: tuple[Path, ...],
     safety_file: Path | None,
     uri: str,
     mocap_uri: str | None,
@@ -87,6 +99,7 @@ def fly(
     options.check_place(uri, safety_file, records)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
+    _check_after(after, lines, planning)
     if path_or_plan is None or lines is not None:
         return _steer(path_or_plan, lines, on_board, safety_file, uri, mocap_uri, records, watched, yes, as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
@@ -95,8 +108,11 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        prepare = _preparation(on_board)
-        prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
+        prepare, flight_options = _preparation(on_board), options.flight_options(planning, safety_file, path_or_plan)
+        if after:
+            prepared = _prepare_again(prepare, after, path_or_plan, limits, flight_options, on_board, uri, steps)
+        else:
+            prepared = prepare(path_or_plan, limits, flight_options, steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
@@ -114,6 +130,36 @@ def _preparation(on_board: bool) -> "Callable[..., Prepared]":
     from cfplan.preparation.prepare_flight import prepare_flight
 
     return prepare_flight
+
+
+def _check_after(after: tuple[Path, ...], lines: str | None, planning: dict[str, Any]) -> None:
+    """Raise InputError where --after stands beside an option that asks for a new plan."""
+    chosen = [f"--{name}" for name in ("nodes", "model") if planning[name] is not None]
+    chosen += ["--speed"] if planning["speed_factor"] is not None else []
+    chosen += ["--planner"] if planning["planner"] != "auto" else []
+    chosen += ["--waypoints"] if lines is not None else []
+    if after and chosen:
+        raise InputError(
+            f"{chosen[0]} asks for a new plan, and --after flies that of the records", where="--after",
+            hint="leave one of them out",
+        )  # fmt: skip
+
+
+def _prepare_again(
+    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], path_or_plan: Path, limits: "Limits",
+    flight_options: "FlightOptions", on_board: bool, uri: str, steps: Steps,
+) -> "Prepared":  # fmt: skip
+    """Prepare the plan of earlier flights, corrected by what repeated in them."""
+    from cfplan.identification.earlier_flights import earlier_flights, learn_correction
+
+    with steps.step("records") as results:
+        earlier = earlier_flights(after, path_or_plan, limits, on_board=on_board)
+        learned = learn_correction(earlier.flights)
+        results.append(learned.describe())
+        if earlier.uri != uri:
+            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle strays otherwise")
+    prepared = prepare(earlier.plan_file, limits, replace(flight_options, correction=learned.correction), steps)
+    return replace(prepared, planned=replace(prepared.planned, name=earlier.name))
 
 
 def _steer(path_or_plan: Path | None, lines: str | None, on_board: bool, *flight: Any) -> int:

@@ -15,13 +15,15 @@ from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry
+from cfplan.geometry.path_file import fingerprint
 from cfplan.identification.advice import suggests_identification
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.on_board_flight import PreparedOnBoard
+from cfplan.preparation.plan_flight import PLAN_SUFFIX
 from cfplan.preparation.prepare_flight import PreparedFlight
-from cfplan.recording.header import header_of_plan
+from cfplan.recording.header import FINGERPRINT, ON_BOARD, header_of_plan
 from cfplan.recording.reader import read_record
-from cfplan.recording.record import Record
+from cfplan.recording.record import PLAN_FILE, UNCORRECTED_FILE, Record
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 from cfplan.steering.starting_vehicle import StartingVehicle
@@ -78,10 +80,17 @@ def _fly_into(
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
     """Fly, and return the outcome and the failures of record or watchers: (which, reason)."""
     name, uri = prepared.planned.name, vehicle.uri
-    save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
-    header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
+    uncorrected, provenance = prepared.planned.uncorrected, {"name": name, "path file": str(source)}
+    save_plan(prepared.plan, folder / PLAN_FILE, provenance)
+    if uncorrected is not None:
+        save_plan(uncorrected, folder / UNCORRECTED_FILE, provenance)
+    header = header_of_plan(
+        prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero(), uncorrected=uncorrected
+    )
+    told = {} if source.suffix == PLAN_SUFFIX else {FINGERPRINT: fingerprint(source)}
     if prepared.mission.on_board is not None:
-        header = replace(header, provenance={**header.provenance, "flown": "on board"})
+        told[ON_BOARD] = "on board"
+    header = replace(header, provenance={**header.provenance, **told})
     with (
         RecordWriter(folder, header) as writer,
         watchers(header, folder, watched) as watching,

@@ -19,7 +19,7 @@ from cfplan.vehicle.trajectory import Trajectory
 DEGREE = 5  # so that the fourth derivative is continuous, as snap makes angular acceleration
 _ORDERS = 5  # the shift and four derivatives
 _AT_REST = DEGREE - 1  # copies of a coefficient beyond an end, for which the spline is constant there
-_LONGEST_PIECE = 0.1  # s, in which a polynomial of degree 9 is within 1e-9 m of the shift
+_LONGEST_PIECE = 0.1  # s, in which a polynomial of degree 9 is within 1e-7 m of the shift
 _SAME = 1e-9  # share of a path's s, nearer than which two ends of pieces are one
 _HERMITE = hermite(_ORDERS)
 
@@ -55,7 +55,7 @@ class Correction:
 def knots_of(duration: float, count: int) -> NDArray:
     """Return the knots, s, of a correction of `count` coefficients."""
     inner = count + 2 * _AT_REST - DEGREE
-    return duration / inner * np.arange(-DEGREE, inner + DEGREE + 1)
+    return duration * (np.arange(-DEGREE, inner + DEGREE + 1) / inner)
 
 
 def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: float) -> Correction:
@@ -77,7 +77,15 @@ def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: fl
 
 
 def corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:
-    """Return the trajectory along the shifted path, with the same speed profile and yaw."""
+    """Return the trajectory along the shifted path, with the same speed profile and yaw.
+
+    Raises InputError where the correction is of a plan of another duration.
+    """
+    if abs(correction.duration - trajectory.duration) > _SAME * trajectory.duration:
+        raise InputError(
+            f"the correction is of a plan of {correction.duration:.3f} s, not {trajectory.duration:.3f} s",
+            where="correction", hint="fly the plan of the flights that it was learned from",
+        )  # fmt: skip
     path, (grid, interval) = trajectory.path, _grid(trajectory)
     length = np.diff(grid)
     scale = (length[:, None] ** np.arange(_ORDERS))[:, :, None]
