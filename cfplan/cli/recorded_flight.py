@@ -15,13 +15,11 @@ from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import Telemetry
-from cfplan.geometry.path_file import fingerprint
 from cfplan.identification.advice import suggests_identification
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.on_board_flight import PreparedOnBoard
-from cfplan.preparation.plan_flight import PLAN_SUFFIX
 from cfplan.preparation.prepare_flight import PreparedFlight
-from cfplan.recording.header import FINGERPRINT, ON_BOARD, header_of_plan
+from cfplan.recording.header import FLOWN, header_of_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, UNCORRECTED_FILE, Record
 from cfplan.recording.summary import summarise
@@ -87,10 +85,8 @@ def _fly_into(
     header = header_of_plan(
         prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero(), uncorrected=uncorrected
     )
-    told = {} if source.suffix == PLAN_SUFFIX else {FINGERPRINT: fingerprint(source)}
     if prepared.mission.on_board is not None:
-        told[ON_BOARD] = "on board"
-    header = replace(header, provenance={**header.provenance, **told})
+        header = replace(header, provenance={**header.provenance, FLOWN: "on board"})
     with (
         RecordWriter(folder, header) as writer,
         watchers(header, folder, watched) as watching,

@@ -18,7 +18,7 @@ from cfplan.errors import InputError
 from cfplan.geometry.path_file import fingerprint
 from cfplan.planning.plan_file import load_plan
 from cfplan.planning.plan_result import Plan
-from cfplan.recording.header import FINGERPRINT, ON_BOARD
+from cfplan.recording.header import FINGERPRINT, FLOWN
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, UNCORRECTED_FILE, Record
 from cfplan.recording.summary import finished, reference_span
@@ -169,7 +169,7 @@ def _read(folder: Path, limits: Limits, on_board: bool) -> tuple[Record, Path, P
         raise InputError("its plan was changed in the air", where=where, hint="name flights of a path or a plan file")
     if not finished(record):
         raise InputError("its plan was not flown to the end", where=where, hint=_FLOWN_HINT)
-    if (ON_BOARD in record.header.provenance) is not on_board:
+    if (FLOWN in record.header.provenance) is not on_board:
         how = ("streamed", "add --on-board only to flights on board") if on_board else ("on board", "add --on-board")
         raise InputError(f"it was flown {how[0]}", where=where, hint=how[1])
     asked = load_plan(record.folder / PLAN_FILE)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.files.json_values import json_value, whole_characters
 from cfplan.flight.setpoints.encoding import LEAD, RATE
+from cfplan.geometry.path_file import fingerprint
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import Box, Cylinder, Obstacle
 from cfplan.vehicle.airframe import Airframe, airframe_of
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 Triple = tuple[float, float, float]
 
 PROMISED_LATENESS = 2e-3  # s, of all setpoints but one in a hundred
-FINGERPRINT, ON_BOARD = "path file's fingerprint", "flown"  # keys of the provenance
+FINGERPRINT, FLOWN = "path file's fingerprint", "flown"  # keys of the provenance
 _PATH_SAMPLES = 500  # of the drawn path
 _NO_SHIFT = np.empty((0, 3))
 
@@ -134,9 +135,10 @@ def _bounds(limits: Limits) -> FlightBounds:
 def header_of_plan(
     plan: "Plan", *, name: str, uri: str, source: FilePath, wall_time_at_zero: float, uncorrected: "Plan | None" = None
 ) -> RecordHeader:
-    """Return the header of the flight of a plan that was made from, or read from, `source`.
+    """Return the header of the flight of a plan that was made from a path file, or read from a plan file.
 
-    `uncorrected` is the plan where the vehicle is wanted, if what it is asked to fly is corrected.
+    `uncorrected` is the plan where the vehicle is wanted, if what it is asked to fly is corrected. Raises
+    InputError where the path file cannot be read.
     """
     limits, wanted = plan.limits, uncorrected or plan
     header = header_under(
@@ -148,13 +150,18 @@ def header_of_plan(
         travel_time=plan.trajectory.duration,
         path=wanted.path(np.linspace(0.0, wanted.path.end, _PATH_SAMPLES)),
         wall_time_at_zero=wall_time_at_zero,
-        provenance={"path file": str(source), "planner": plan.planner},
+        provenance={"path file": str(source), "planner": plan.planner} | _fingerprint(source),
     )
     if uncorrected is None:
         return header
     times = np.arange(int(np.ceil(plan.trajectory.duration * RATE)) + 2) / RATE + LEAD
     s = plan.trajectory.s_at(times)
     return replace(header, shift=np.round(plan.path(s) - uncorrected.path(s), 6))
+
+
+def _fingerprint(source: FilePath) -> dict[str, str]:
+    """Return that of a path file; nothing of a plan file, which holds its motion itself, and where there is no file."""
+    return {} if source.suffix == ".parquet" or not source.is_file() else {FINGERPRINT: fingerprint(source)}
 
 
 def header_to_json(header: RecordHeader) -> str:

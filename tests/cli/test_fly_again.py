@@ -1,10 +1,12 @@
 """`cfplan fly --after`: the second flight of a plan, on a vehicle that is not what its airframe says."""
 
+import shlex
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
 
 import numpy as np
+import pages
 import pytest
 from stepped_flight import fly_stepped
 
@@ -119,7 +121,7 @@ def test_second_flights_of_fast_paths_stay_nearer(patched, cfplan, tmp_path, pat
     [
         (("^  speed: 2.0", "  speed: 1.9"), "limits of plans"),
         (("^  margin: 0.2", "  margin: 0.21"), "room"),
-        (("^vehicle: .*", "vehicle: crazyflie-2.1"), "airframe"),
+        (("^vehicle: .*", "vehicle: crazyflie-2.0"), "airframe"),
     ],
     ids=["limits", "room", "airframe"],
 )
@@ -152,3 +154,13 @@ def test_a_folder_that_is_no_record_is_refused(patched, cfplan, tmp_path):
     ended = cfplan("fly", REPOSITORY / "flights" / "line.yaml", "--after", tmp_path)
     assert ended.code == 2
     assert "flight.mcap" in ended.err
+
+
+@pytest.mark.parametrize("line", pages.lines_for(pages.AGAIN))
+def test_a_second_flight_goes_as_it_is_shown(first, cfplan, tmp_path, line):
+    """But for the path, and for the records, each of which is that of the first flight here."""
+    path, *words = shlex.split(line)[2:]
+    assert path.startswith("flights/")
+    after = [first[0] if word.startswith("records/") else word for word in words]
+    assert after != words
+    fly(cfplan, tmp_path, REPOSITORY / "flights" / "line.yaml", *after)
