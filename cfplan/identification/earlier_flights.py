@@ -23,7 +23,7 @@ from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE, UNCORRECTED_FILE, Record
 from cfplan.recording.summary import finished, reference_span
 from cfplan.safety.limits import Limits
-from cfplan.vehicle.correction import Correction, fit_correction
+from cfplan.vehicle.correction import PlanCorrection, fit_correction
 from cfplan.vehicle.trajectory import Trajectory
 
 SPACING = (
@@ -51,7 +51,8 @@ class EarlierFlight:
 class Learned:
     """What earlier flights of a plan teach."""
 
-    correction: Correction
+    correction: PlanCorrection
+    shift: float  # m, the largest of it
     before: float  # m, largest distance from the plan in the last flight
     expected: float  # m, the same with the correction, the mean over the flights had they flown with it
     unrepeated: float  # m rms, by which a flight differs from the others; NaN of one flight
@@ -59,10 +60,9 @@ class Learned:
 
     def describe(self) -> str:
         """Return it in one line."""
-        shift = np.linalg.norm(self.correction.coefficients, axis=1).max()
         text = (
             f"{100 * self.before:.1f} cm largest deviation in the last, {100 * self.expected:.1f} cm expected with a "
-            f"correction of {100 * shift:.1f} cm at most"
+            f"correction of {100 * self.shift:.1f} cm at most"
         )
         if np.isfinite(self.unrepeated):
             text += f"; {100 * self.unrepeated:.1f} cm rms does not repeat"
@@ -78,14 +78,15 @@ def learn_correction(flights: Sequence[EarlierFlight]) -> Learned:
     seen = [_strayed(flight) for flight in flights]
     each = [fit_correction(one.time, one.off, duration, SPACING) for one in seen]
     mean = np.mean([one.coefficients for one in each], axis=0)
-    correction, last = Correction(-mean, duration), seen[-1]
+    correction, last = PlanCorrection(-mean, duration), seen[-1]
 
     even = np.linspace(0.0, duration, max(round(duration / SPACING), 2) * 4)
-    differing = [_rms(Correction(one.coefficients - mean, duration).at(even)[:, 0]) for one in each]
+    differing = [_rms(PlanCorrection(one.coefficients - mean, duration).at(even)[:, 0]) for one in each]
     variance = float(np.sum(np.square(differing))) / (count - 1) if count > 1 else np.nan
     left = _rms(each[-1].at(last.time)[:, 0] + last.shift)  # from the plan, as far as it can be learned
     return Learned(
         correction,
+        shift=_largest(correction.at(even)[:, 0]),
         before=_largest(last.off + last.shift),
         expected=float(np.mean([_largest(one.off + correction.at(one.time)[:, 0]) for one in seen])),
         unrepeated=float(np.sqrt(variance)),

@@ -28,7 +28,7 @@ from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
-from cfplan.vehicle.correction import Correction, corrected
+from cfplan.vehicle.correction import PlanCorrection, corrected
 from cfplan.vehicle.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class FlightOptions:
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
     budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
     models: tuple[Path, ...] = ()  # folders of models to look in first
-    correction: Correction | None = None  # of a plan file, learned from earlier flights of it
+    correction: PlanCorrection | None = None  # of a plan file, learned from earlier flights of it
 
 
 @dataclass(frozen=True, slots=True)

@@ -223,7 +223,7 @@ def finished(record: Record) -> bool:
         return False
     period = float(np.median(np.diff(due)))
     last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
-    least = committed_time(record) - 2 * period
+    least = committed_time(record) - 3 * period
     return bool(due[-1] - due[0] >= least and last * period >= least)
 
 

@@ -1,4 +1,4 @@
-"""Correction: a shift of what a vehicle is asked to fly, by what it strayed in earlier flights of the same plan.
+"""Correction of a plan: a shift of what a vehicle is asked to fly, by what it strayed in earlier flights of it.
 
 The shift is a B-spline over the plan's time, constant with four derivatives at both ends. A trajectory with it is a
 trajectory again, along γ(s) + δ(t(s)) by the same profile: all that certifies, encodes and flies trajectories does so
@@ -25,7 +25,7 @@ _HERMITE = hermite(_ORDERS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Correction:
+class PlanCorrection:
     """A shift over the time of a plan; before its start and after its end the shift stays what it is there.
 
     Raises InputError where there is no coefficient, or a number that is not finite, or no duration.
@@ -58,7 +58,7 @@ def knots_of(duration: float, count: int) -> NDArray:
     return duration * (np.arange(-DEGREE, inner + DEGREE + 1) / inner)
 
 
-def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: float) -> Correction:
+def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: float) -> PlanCorrection:
     """Return the correction nearest to shifts, (N, 3) m at times, (N,) s, with knots about `spacing`, s, apart.
 
     That is a low-pass without phase: what is faster than 1 / (2 spacing) is left out. Each two neighbours of the times
@@ -73,10 +73,10 @@ def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: fl
         matrix = np.ones((len(times), 1))
     else:
         matrix = np.column_stack([first, matrix[:, _AT_REST + 1 : -_AT_REST - 1], last])
-    return Correction(np.linalg.lstsq(matrix, shifts, rcond=None)[0], duration)
+    return PlanCorrection(np.linalg.lstsq(matrix, shifts, rcond=None)[0], duration)
 
 
-def corrected(trajectory: Trajectory, correction: Correction) -> Trajectory:
+def corrected(trajectory: Trajectory, correction: PlanCorrection) -> Trajectory:
     """Return the trajectory along the shifted path, with the same speed profile and yaw.
 
     Raises InputError where the correction is of a plan of another duration.
@@ -114,7 +114,7 @@ def _grid(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     return np.append(np.concatenate(inner), trajectory.path.end), np.repeat(np.arange(len(parts)), parts)
 
 
-def _by_path(trajectory: Trajectory, correction: Correction, s: NDArray, sample: ProfileSample) -> NDArray:
+def _by_path(trajectory: Trajectory, correction: PlanCorrection, s: NDArray, sample: ProfileSample) -> NDArray:
     """Return the shift and four derivatives by s, (M, 5, 3), at s, (M,), where the profile is `sample`."""
     h, dh, ddh, dddh = (each[:, None] for each in (sample.h, sample.dh, sample.ddh, sample.dddh))
     t1 = h**-0.5  # of t(s)

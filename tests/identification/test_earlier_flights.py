@@ -7,7 +7,7 @@ from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.identification.earlier_flights import HOVER, LARGEST, EarlierFlight, learn_correction
 from cfplan.vehicle.airframes import AIRFRAMES
-from cfplan.vehicle.correction import Correction, corrected
+from cfplan.vehicle.correction import PlanCorrection, corrected
 from cfplan.vehicle.trajectory import Trajectory
 
 
@@ -29,7 +29,7 @@ def flown(planned, asked=None, *, chance=0.0, seed=0, gap=(0.0, 0.0), more=0.0):
     asked, random = asked or planned, np.random.default_rng(seed)
     times = np.arange(0.0, asked.duration + HOVER + 0.1, 0.01)
     times = times[(times <= gap[0]) | (times >= gap[1])]
-    wave = Correction(random.normal(0.0, chance, (round(planned.duration / 0.5), 3)), planned.duration)
+    wave = PlanCorrection(random.normal(0.0, chance, (round(planned.duration / 0.5), 3)), planned.duration)
     s = asked.s_at(times)
     off = straying(planned, s) + wave.at(planned.time_at(s))[:, 0] + random.normal(0.0, 1e-3, (len(times), 3))
     off[len(off) // 2] += more

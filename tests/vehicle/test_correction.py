@@ -8,7 +8,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import shifted
 from cfplan.vehicle.airframes import AIRFRAMES
-from cfplan.vehicle.correction import Correction, corrected, fit_correction
+from cfplan.vehicle.correction import PlanCorrection, corrected, fit_correction
 from cfplan.vehicle.trajectory import Trajectory
 
 WAYPOINTS = [[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]]
@@ -33,7 +33,7 @@ def trajectory(make_profile):
 @pytest.fixture(scope="module")
 def correction(trajectory):
     count = round(trajectory.duration / 0.3)
-    return Correction(np.random.default_rng(4).uniform(-0.05, 0.05, (count, 3)), trajectory.duration)
+    return PlanCorrection(np.random.default_rng(4).uniform(-0.05, 0.05, (count, 3)), trajectory.duration)
 
 
 @pytest.mark.parametrize("order", range(len(NEARLY)))
@@ -77,9 +77,9 @@ def test_a_short_flight_is_fitted_too(duration):
 )
 def test_no_numbers_and_no_time_are_refused(coefficients, duration):
     with pytest.raises(InputError, match="correction"):
-        Correction(coefficients, duration)
+        PlanCorrection(coefficients, duration)
 
 
 def test_a_correction_of_another_plan_is_refused(trajectory):
     with pytest.raises(InputError, match=r"not \d"):
-        corrected(trajectory, Correction(np.zeros((4, 3)), trajectory.duration + 0.1))
+        corrected(trajectory, PlanCorrection(np.zeros((4, 3)), trajectory.duration + 0.1))
