@@ -114,15 +114,13 @@ def fly_with_estimator(
     Without the estimator the controller knows the true state. At `level_at` and `off_at`, s, the supervisor of a
     vehicle that has lost its link levels it out, and stops its motors.
     """
-    by_lee = isinstance(gains, LeeGains)
-    steps = len(scale)
+    by_lee, steps = isinstance(gains, LeeGains), len(scale)
     states, beliefs = np.zeros((steps, STATE_SIZE)), np.zeros((steps, BELIEF_SIZE))
     states[0, :BELIEF_SIZE] = beliefs[0] = start
     states[0, MOTORS] = airframe.hover_thrust
     vehicle = new_vehicle(states[0], pack_airframe(airframe, floor=-np.inf))
     if memory is not None:
         vehicle[MEMORY : MEMORY + len(memory)] = memory
-    most = airframe.motor_thrust_max
     per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
     prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
     attitude_latency = poses.latency if poses.attitude_latency is None else poses.attitude_latency
@@ -140,7 +138,7 @@ def fly_with_estimator(
         mode=mode,
         gains=gains.pack(),
         vehicle=vehicle,
-        levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
+        levers=np.array([airframe.arm, airframe.thrust_to_torque, airframe.motor_thrust_max, per_unit, not by_lee]),
         scale=np.asarray(scale, dtype=float),
         arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
         noise=np.ascontiguousarray(poses.noise, dtype=float),
