@@ -2,6 +2,7 @@
 
 import shlex
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,11 +111,8 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        prepare, flight_options = _preparation(on_board), options.flight_options(planning, safety_file, path_or_plan)
-        if after:
-            prepared = _prepare_again(prepare, after, path_or_plan, limits, flight_options, on_board, uri, steps)
-        else:
-            prepared = prepare(path_or_plan, limits, flight_options, steps)
+        prepare = _preparation(on_board, after, uri)
+        prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
@@ -123,15 +121,13 @@ def fly(
     return int(flown.outcome.exit_code)
 
 
-def _preparation(on_board: bool) -> "Callable[..., Prepared]":
-    """Return the function that prepares a streamed flight, or one on board."""
-    if on_board:
-        from cfplan.preparation.on_board_flight import prepare_on_board_flight
-
-        return prepare_on_board_flight
+def _preparation(on_board: bool, after: tuple[Path, ...], uri: str) -> "Callable[..., Prepared]":
+    """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others."""
+    from cfplan.preparation.on_board_flight import prepare_on_board_flight
     from cfplan.preparation.prepare_flight import prepare_flight
 
-    return prepare_flight
+    prepare: Callable[..., Prepared] = prepare_on_board_flight if on_board else prepare_flight
+    return partial(_prepare_again, prepare, after, on_board, uri) if after else prepare
 
 
 def _check_after(after: tuple[Path, ...], lines: str | None, planning: dict[str, Any]) -> None:
@@ -148,8 +144,8 @@ def _check_after(after: tuple[Path, ...], lines: str | None, planning: dict[str,
 
 
 def _prepare_again(
-    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], path_or_plan: Path, limits: "Limits",
-    flight_options: "FlightOptions", on_board: bool, uri: str, steps: Steps,
+    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], on_board: bool, uri: str,
+    path_or_plan: Path, limits: "Limits", flight_options: "FlightOptions", steps: Steps,
 ) -> "Prepared":  # fmt: skip
     """Prepare the plan of earlier flights, corrected by what repeated in them."""
     from cfplan.identification.earlier_flights import earlier_flights, learn_correction
