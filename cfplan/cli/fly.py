@@ -101,9 +101,8 @@ def fly(
     options.check_place(uri, safety_file, records)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
-    _check_after(after, lines, planning)
     if path_or_plan is None or lines is not None:
-        place = _source_of_waypoints(path_or_plan, lines, on_board)
+        place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
@@ -111,7 +110,7 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        prepare = _preparation(on_board, after, uri)
+        prepare = _preparation(on_board, after, planning, uri)
         prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
@@ -121,22 +120,29 @@ def fly(
     return int(flown.outcome.exit_code)
 
 
-def _preparation(on_board: bool, after: tuple[Path, ...], uri: str) -> "Callable[..., Prepared]":
-    """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others."""
+def _preparation(
+    on_board: bool, after: tuple[Path, ...], planning: dict[str, Any], uri: str
+) -> "Callable[..., Prepared]":  # fmt: skip
+    """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others.
+
+    Raises InputError where an option asks for a new plan after others.
+    """
     from cfplan.preparation.on_board_flight import prepare_on_board_flight
     from cfplan.preparation.prepare_flight import prepare_flight
 
     prepare: Callable[..., Prepared] = prepare_on_board_flight if on_board else prepare_flight
-    return partial(_prepare_again, prepare, after, on_board, uri) if after else prepare
+    if not after:
+        return prepare
+    _require_no_new_plan(planning)
+    return partial(_prepare_again, prepare, after, on_board, uri)
 
 
-def _check_after(after: tuple[Path, ...], lines: str | None, planning: dict[str, Any]) -> None:
-    """Raise InputError where --after stands beside an option that asks for a new plan."""
+def _require_no_new_plan(planning: dict[str, Any]) -> None:
+    """Raise InputError where an option asks for a plan other than that of the records of --after."""
     chosen = [f"--{name}" for name in ("nodes", "model") if planning[name] is not None]
     chosen += ["--speed"] if planning["speed_factor"] is not None else []
     chosen += ["--planner"] if planning["planner"] != "auto" else []
-    chosen += ["--waypoints"] if lines is not None else []
-    if after and chosen:
+    if chosen:
         raise InputError(
             f"{chosen[0]} asks for a new plan, and --after flies that of the records", where="--after",
             hint="leave one of them out",
@@ -160,8 +166,12 @@ def _prepare_again(
     return replace(prepared, planned=replace(prepared.planned, name=earlier.name))
 
 
-def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool) -> str:
+def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool, after: tuple[Path, ...]) -> str:
     """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
+    if after and lines is not None:
+        raise InputError(
+            "waypoints that come in the air make a new plan", where="--after", hint="name the path of the records"
+        )
     if on_board and lines is not None:
         raise InputError(
             "waypoints that come in the air are streamed", where="--on-board", hint="name a path, or leave it out"

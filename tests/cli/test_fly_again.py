@@ -150,6 +150,12 @@ def test_an_option_that_asks_for_another_flight_is_refused(first, cfplan, option
     assert "hint:" in ended.err
 
 
+def test_waypoints_in_the_air_are_no_second_flight(cfplan, tmp_path):
+    ended = cfplan("fly", "--waypoints", "-", "--after", tmp_path)
+    assert ended.code == 2
+    assert "new plan" in ended.err
+
+
 def test_a_folder_that_is_no_record_is_refused(patched, cfplan, tmp_path):
     ended = cfplan("fly", REPOSITORY / "flights" / "line.yaml", "--after", tmp_path)
     assert ended.code == 2
