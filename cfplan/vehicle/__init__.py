@@ -3,6 +3,7 @@
 __all__ = [
     "airframe",
     "airframes",
+    "correction",
     "flatness",
     "hover",
     "joint",
