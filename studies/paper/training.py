@@ -278,8 +278,9 @@ def _judge(network: SequenceNetwork, unseen: Sequences, options: SequenceOptions
     network.eval()
     found = answer(network, unseen.inputs, options.inputs)
     h, yaw = losses(network, torch.from_numpy(found), torch.from_numpy(unseen.answers), options)
+    value = (h + YAW * yaw).item()
     errors = nodal_time(found, unseen.end) / nodal_time(unseen.answers, unseen.end) - 1.0
-    return (h + YAW * yaw).item(), float(errors.mean()), float(np.abs(errors).mean()), float(np.quantile(np.abs(errors), 0.95))
+    return value, float(errors.mean()), float(np.abs(errors).mean()), float(np.quantile(np.abs(errors), 0.95))
 
 
 def losses(network: SequenceNetwork, found: Tensor, wanted: Tensor, options: SequenceOptions) -> Tensor:

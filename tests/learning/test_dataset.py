@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.path_families import Family
 from cfplan.geometry.path_file import PathShape
 from cfplan.geometry.yaw import YawMode
@@ -156,11 +156,11 @@ def test_solve_times_are_kept_apart(made):
 def test_an_interrupted_run_goes_on_where_it_stopped(made, tmp_path, monkeypatch):
     labelled: list[int] = []
 
-    def label_until_interrupted(spec, number):
+    def label_until_interrupted(spec, number, choose=None):
         if len(labelled) == 1:
             raise KeyboardInterrupt
         labelled.append(number)
-        return label_shard(spec, number)
+        return label_shard(spec, number, choose)
 
     monkeypatch.setattr(dataset, "label_shard", label_until_interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -309,10 +309,13 @@ def test_toppquad_labels_the_same_paths(tmp_path):
         assert theirs == pytest.approx(ours, rel=0.03)
 
 
-def test_chosen_paths_lead_through_the_same_waypoints_and_are_flown_sooner(made, tmp_path):
-    make_dataset(tmp_path, replace(SMALL, shape=PathShape.FASTEST), choose=fastest_by_search)
+def test_chosen_paths_lead_through_the_same_waypoints_and_are_flown_sooner(tmp_path):
+    plain_spec = replace(SMALL, boxes=((3.0, 3.0, 1.5),))
+    made = tmp_path / "plain", tmp_path / "chosen"
+    make_dataset(made[0], plain_spec)
+    make_dataset(made[1], replace(plain_spec, shape=PathShape.FASTEST), choose=fastest_by_search)
     times = []
-    for chosen, plain in zip(*(read_dataset(folder)[1].to_pylist() for folder in (tmp_path, made)), strict=True):
+    for plain, chosen in zip(*(read_dataset(folder)[1].to_pylist() for folder in made), strict=True):
         assert chosen["status"] == "SOLVED"
         paths = [Curve(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
                  for row in (chosen, plain)]  # fmt: skip
