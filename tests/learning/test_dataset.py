@@ -310,7 +310,7 @@ def test_toppquad_labels_the_same_paths(tmp_path):
 
 
 def test_chosen_paths_lead_through_the_same_waypoints_and_are_flown_sooner(tmp_path):
-    plain_spec = replace(SMALL, boxes=((3.0, 3.0, 1.5),))
+    plain_spec = replace(SMALL, waypoints=(3, 4))
     made = tmp_path / "plain", tmp_path / "chosen"
     make_dataset(made[0], plain_spec)
     make_dataset(made[1], replace(plain_spec, shape=PathShape.FASTEST), choose=fastest_by_search)
