@@ -4,10 +4,12 @@ __all__ = [
     "active_limits",
     "continuation",
     "figure",
+    "fleet",
     "path",
     "plan",
     "plan_file",
     "plan_result",
     "planners",
     "repair",
+    "under_caps",
 ]
