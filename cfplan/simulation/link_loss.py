@@ -36,13 +36,12 @@ from cfplan.simulation.engine.layout import (
     pack_airframe,
     setpoint_rows,
 )
-from cfplan.simulation.engine.run import NEVER, PART, Schedule, Vehicles, arrival_times, simulate
+from cfplan.simulation.engine.run import NEVER, Schedule, Vehicles, arrival_times, simulate
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER = Timeouts().level_out_at_latest
 _PARTS = 9  # boxes of a sweep, if there are obstacles
-TUBE_PARTS, TUBE_PART = 20, 0.001 * PART  # boxes of a tube, and s of each; the last one lasts
 _STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
 _LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
 _NEAR = 0.1  # m from a wall, within which an accelerometer that reads too much is simulated too
@@ -181,18 +180,6 @@ def link_loss_within_stops(
     return _judge(times, places, boxes, limits, np.empty((len(starts), 0, SNAPSHOT_SIZE)))
 
 
-def link_loss_tubes(payloads: NDArray, limits: Limits, rows: NDArray, rate: float = RATE) -> NDArray:
-    """Lose the link after the setpoints `rows`, (F,), of a flight, (N, 29) uint8 at `rate`, Hz.
-
-    Returns boxes, (F, TUBE_PARTS, 2, 3) m: low and high corner of what the vehicle sweeps in each TUBE_PART seconds
-    from the setpoint; the last one is from then until it lies, so that it also shows where.
-    """
-    state = decode(payloads)
-    setpoints, airframes = setpoint_rows(state), _airframes(limits)
-    snapshots = _flown(setpoints, limits, airframes, rate, _begins(state, limits, None))
-    return _swept(_Forks(setpoints, rows, snapshots[:, rows], airframes, parts=TUBE_PARTS), limits)
-
-
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
     """Return those of the snapshots, (L, ...) for each motor lag, that have the airframe's lag in safety.yaml."""
     return np.asarray(snapshots[_lags(limits).index(limits.airframe.motor_time_constant)])
@@ -284,7 +271,6 @@ class _Forks(NamedTuple):
     snapshots: NDArray  # (L, F, 31) when they arrive
     airframes: NDArray  # (L, 26)
     step: int = _STEP  # ms; a first look has _FIRST_STEP
-    parts: int = 0  # boxes of each sweep; 0: one, or _PARTS if there are obstacles
 
 
 def _swept(forks: _Forks, limits: Limits) -> NDArray:
@@ -330,7 +316,7 @@ def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> N
         forks.snapshots.reshape(-1, SNAPSHOT_SIZE), np.repeat(forks.airframes, count, axis=0), last, last,
         np.full(len(last), NEVER), np.tile([0.0, 0.0, error], (len(last), 1)),
     )  # fmt: skip
-    parts = forks.parts or (_PARTS if limits.space.obstacles else 1)
+    parts = _PARTS if limits.space.obstacles else 1
     return _united(list(simulate(batch, schedule, parts=parts).boxes.reshape(lags, count, parts, 2, 3)))
 
 

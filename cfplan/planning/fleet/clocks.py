@@ -20,14 +20,6 @@ RAMP = 6  # ticks from one rate to the next: 1.04 /s, which from 2 m/s brakes by
 _START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8  # how a state is reached: from rest, at the same, a lower, a higher rate
 
 
-class Others(NamedTuple):
-    """Vehicles whose flights are known, at every tick until all rest."""
-
-    columns: NDArray  # (K, T, W, 2) m: x and y at W moments of the skew about each tick
-    hazard: NDArray  # (T', U', LEVELS + 1) bool: where one could not get out of the way of another that is lost
-    stride: int  # ticks, and LEVELS times as many cells, from one row of `hazard` to the next
-
-
 class Clock(NamedTuple):
     """A clock of a vehicle, from the fleet's start to the end of its path."""
 
@@ -62,13 +54,14 @@ def cells_of(duration: float) -> NDArray:
     return CELL * np.arange(int(np.ceil(duration / CELL)) + LEVELS)
 
 
-def fastest_clock(own: NDArray, others: Others, apart: float) -> Clock | Stuck:
+def fastest_clock(own: NDArray, others: NDArray, apart: float) -> Clock | Stuck:
     """Return the clock that reaches the end soonest, `apart`, m, from all others.
 
-    `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan.
+    `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan; `others`, (K, T, W, 2) m, are those of K
+    vehicles whose flights are known, at W moments of the skew about each tick until all rest.
     """
-    conflict = _conflicts(own, others.columns, apart)
-    how, end, cell, level = _reached(conflict, others.hazard, others.stride)
+    conflict = _conflicts(own, others, apart)
+    how, end, cell, level = _reached(conflict)
     if level > 0:
         return Clock(*_followed(how, end, cell, level))
     found = how.any(axis=2)
@@ -90,7 +83,7 @@ def _conflicts(own: NDArray, columns: NDArray, apart: float) -> NDArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def _reached(conflict: NDArray, hazard: NDArray, stride: int) -> tuple[NDArray, int, int, int]:
+def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
     """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the soonest end.
 
     The level is 0 where no end is reached.
@@ -101,9 +94,9 @@ def _reached(conflict: NDArray, hazard: NDArray, stride: int) -> tuple[NDArray, 
     how = np.zeros((ticks, cells, LEVELS + 1), dtype=np.uint8)
     stays = np.ones(ticks + 1, dtype=np.bool_)  # whether it may rest at its end from a tick on
     for t in range(ticks - 1, -1, -1):
-        stays[t] = stays[t + 1] and _free(conflict, hazard, stride, t, end, 0)
+        stays[t] = stays[t + 1] and _free(conflict, t, end)
     for t in range(ticks):
-        if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, hazard, stride, t, 0, 0):
+        if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, t, 0):
             for level in range(LEVELS + 1):
                 how[t, 0, level] |= _START
         for u in range(cells):
@@ -114,21 +107,19 @@ def _reached(conflict: NDArray, hazard: NDArray, stride: int) -> tuple[NDArray, 
                     if stays[t]:
                         return how, t, u, level
                     continue
-                if t + 1 < ticks and _free(conflict, hazard, stride, t + 1, u + level, level):
+                if t + 1 < ticks and _free(conflict, t + 1, u + level):
                     how[t + 1, u + level, level] |= _SAME
                 for change in (-1, 1):
                     if 1 <= level + change <= LEVELS and t + RAMP < ticks and u + _passed(level, change, RAMP) <= end:
-                        _ramp(how, conflict, hazard, stride, t, u, level, change)
+                        _ramp(how, conflict, t, u, level, change)
     return how, 0, 0, 0
 
 
 @njit(error_model="numpy")
-def _ramp(
-    how: NDArray, conflict: NDArray, hazard: NDArray, stride: int, t: int, u: int, level: int, change: int
-) -> None:
+def _ramp(how: NDArray, conflict: NDArray, t: int, u: int, level: int, change: int) -> None:
     """Reach the state behind a change of rate from a state, unless it is in conflict on the way."""
     for k in range(1, RAMP + 1):
-        if not _free(conflict, hazard, stride, t + k, u + _passed(level, change, k), max(level, level + change)):
+        if not _free(conflict, t + k, u + _passed(level, change, k)):
             return
     how[t + RAMP, u + _passed(level, change, RAMP), level + change] |= _FASTER if change < 0 else _SLOWER
 
@@ -140,9 +131,9 @@ def _passed(level: int, change: int, ticks: int) -> int:
 
 
 @njit(error_model="numpy")
-def _free(conflict: NDArray, hazard: NDArray, stride: int, t: int, u: int, level: int) -> bool:
-    row, column = min(t // stride, hazard.shape[0] - 1), min(u // (stride * LEVELS), hazard.shape[1] - 1)
-    return not (conflict[min(t, len(conflict) - 1), u] or hazard[row, column, level])
+def _free(conflict: NDArray, t: int, u: int) -> bool:
+    """Return whether a state is out of conflict; behind the last tick of the map all others rest."""
+    return not conflict[min(t, len(conflict) - 1), u]
 
 
 @njit(error_model="numpy")

@@ -6,7 +6,8 @@ A clock that only waits at the start is exact. One that slows on the way becomes
 planned again, so that all limits hold; what comes of it is measured against the others, not assumed.
 """
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -15,19 +16,22 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.random_paths import generator
-from cfplan.planning.fleet.clocks import CELL, LEVELS, TICK, Clock, Others, Stuck, cells_of, fastest_clock
-from cfplan.planning.fleet.hazards import STRIDE, LossModel, hazard_map
+from cfplan.planning.fleet.clocks import CELL, TICK, Clock, Stuck, cells_of, fastest_clock
 from cfplan.planning.fleet.members import FleetMember, places
-from cfplan.planning.fleet.separation import pair_separation
+from cfplan.planning.fleet.separation import Separation, separations
+from cfplan.planning.plan_result import Plan
 from cfplan.planning.under_caps import under_caps
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.trajectory import Trajectory
 
 ORDERS, TRIALS = 24, 6  # tried roughly, and of these made, the fastest first
-SLACKS = (0.02, 0.05, 0.1)  # m added to the distance that a search keeps, until what comes of it keeps the distance
+SLACKS = (0.02, 0.05, 0.1)  # m added to the distance that a search keeps, tried until the certificate passes
 _BETWEEN_SKEWS = 0.03  # s, at most, between the moments of the skew at which a search compares
 _LEAST_SPEED = 0.05  # m/s, of caps
 _PLACES = 0.02  # s of a plan from one place of its caps to the next
+
+
+Finish = Callable[[Plan], Plan]  # makes what was planned again ready to fly; raises InfeasibleError
 
 
 class Blocked(NamedTuple):
@@ -40,7 +44,7 @@ class Blocked(NamedTuple):
     def __str__(self) -> str:
         a, b = self.pair
         x, y = self.place
-        return f"{a} gets no farther than ({x:.2f}, {y:.2f}) m at {self.time:.2f} s for {b}"
+        return f"{b} blocks {a} at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s after the start"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,18 +77,19 @@ class _Track:
 
 
 def coordinate(
-    members: Sequence[FleetMember], apart: float, skew: float, loss: LossModel | None = None
+    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish
 ) -> tuple[FleetMember, ...] | Blocked:
     """Return the members with delays and slower plans, whose columns stay `apart`, m, for clocks `skew`, s, apart.
 
-    With `loss`, clocks are sought with which vehicles can get out of the way of a lost one.
+    `finish` is applied to each plan that is made slower, before it is compared with others.
     """
+    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish)
     found: list[tuple[float, tuple[int, ...]]] = []
     blocked: Blocked | None = None
     longest = max(member.plan.trajectory.duration for member in members)
     orders = _Orders([member.plan.trajectory.duration for member in members])
     for order in orders:
-        tracks = _sketched(members, order, apart, skew, loss)
+        tracks = search.sketch(order)
         if isinstance(tracks, Blocked):
             blocked = blocked or tracks
             orders.prefer(next(n for n in order if members[n].name == tracks.pair[0]))
@@ -95,7 +100,7 @@ def coordinate(
             break
         orders.prefer(last.number)
     for _, order in sorted(found)[:TRIALS]:
-        made = _made(members, order, apart, skew, loss)
+        made = search.make(order)
         if not isinstance(made, Blocked):
             return made
         blocked = blocked or made
@@ -126,98 +131,94 @@ class _Orders:
         self._next = (first, *(number for number in self._tried[-1] if number != first))
 
 
-def _sketched(
-    members: Sequence[FleetMember], order: tuple[int, ...], apart: float, skew: float, loss: LossModel | None
-) -> list[_Track] | Blocked:
-    """Return clocks in an order, without planning again."""
-    tracks: list[_Track] = []
-    for number in order:
-        clock = _clock(members, number, tracks, apart + SLACKS[0], skew, loss)
-        if isinstance(clock, Blocked):
-            return clock
-        tracks.append(_Track(number, members[number].plan.trajectory, clock))
-    return tracks
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Members, what they must keep, and the search for their clocks in one order."""
 
+    members: tuple[FleetMember, ...]
+    apart: float  # m
+    skew: float  # s
+    at_rest: float  # m, from start to start and from end to end, which no clock changes
+    finish: Finish
 
-def _made(
-    members: Sequence[FleetMember], order: tuple[int, ...], apart: float, skew: float, loss: LossModel | None
-) -> tuple[FleetMember, ...] | Blocked:
-    """Return the members with the clocks of an order, each planned again where it is slowed."""
-    tracks: list[_Track] = []
-    for number in order:
-        member = members[number]
-        for slack in SLACKS:
-            clock = _clock(members, number, tracks, apart + slack, skew, loss)
+    def sketch(self, order: tuple[int, ...]) -> list[_Track] | Blocked:
+        """Return clocks in an order, without planning again."""
+        tracks: list[_Track] = []
+        for number in order:
+            clock = self._clock(number, tracks, SLACKS[0])
             if isinstance(clock, Blocked):
                 return clock
-            others = [track.member for track in tracks if track.member is not None]
-            made = _with_clock(member, clock, apart)
-            nearest = [pair_separation(made, other, skew) for other in others] if made else []
-            if made and all(each.keeps(apart) for each in nearest):
-                tracks.append(_Track(number, member.plan.trajectory, None, made))
-                break
-        else:
-            if made is None or not nearest:
-                return Blocked((member.name, members[order[0]].name), (0.0, 0.0), 0.0)
-            worst = min(nearest, key=lambda each: each.distance)
-            return Blocked(worst.pair, worst.place, worst.time)
-    by_number = {track.number: track.member for track in tracks}
-    return tuple(made for n in range(len(members)) if (made := by_number[n]) is not None)
+            tracks.append(_Track(number, self.members[number].plan.trajectory, clock))
+        return tracks
+
+    def make(self, order: tuple[int, ...]) -> tuple[FleetMember, ...] | Blocked:
+        """Return the members with the clocks of an order, each planned again where it is slowed."""
+        tracks: list[_Track] = []
+        for number in order:
+            made = self._track(number, tracks)
+            if isinstance(made, Blocked):
+                return made
+            tracks.append(made)
+        return tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+
+    def _track(self, number: int, tracks: list[_Track]) -> _Track | Blocked:
+        """Return the flight of a vehicle that keeps apart from the tracks of others."""
+        member = self.members[number]
+        blocked: Blocked | None = None
+        for slack in SLACKS:
+            clock = self._clock(number, tracks, slack)
+            if isinstance(clock, Blocked):
+                return blocked or clock
+            try:
+                made = _with_clock(member, clock, self.apart, self.finish)
+            except InfeasibleError:  # too slow for a profile, or what slowing does not make safe
+                slows = int(np.argmax((clock.rate > 0.0) & (clock.rate < 1.0)))
+                blocked = self._blocked(number, Stuck(CELL * float(clock.own[slows]), TICK * slows), tracks)
+                continue
+            nearest = _nearest(made, tracks, self.skew)
+            if nearest is None or nearest.keeps(self.apart):
+                return _Track(number, member.plan.trajectory, None, made)
+            blocked = Blocked(nearest.pair, nearest.place, nearest.time)
+        assert blocked is not None
+        return blocked
+
+    def _clock(self, number: int, tracks: list[_Track], slack: float) -> Clock | Blocked:
+        """Return the fastest clock of a vehicle among the tracks of others."""
+        trajectory = self.members[number].plan.trajectory
+        own = places(trajectory, cells_of(trajectory.duration))
+        ticks = TICK * np.arange(
+            int(np.ceil((max((track.end for track in tracks), default=0.0) + self.skew) / TICK)) + 2
+        )
+        band = np.linspace(-self.skew, self.skew, 2 * int(np.ceil(self.skew / _BETWEEN_SKEWS)) + 1)
+        others = np.zeros((len(tracks), len(ticks), len(band), 2))
+        for row, track in zip(others, tracks, strict=True):
+            row[:] = track.columns(ticks[:, None] + band)
+        clock = fastest_clock(own, others, min(self.apart + slack, max(self.at_rest, self.apart)))
+        return clock if isinstance(clock, Clock) else self._blocked(number, clock, tracks)
+
+    def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
+        """Return where a vehicle is stuck, and which of the others is nearest to where it would go."""
+        trajectory = self.members[number].plan.trajectory
+        (x, y), ahead = places(trajectory, np.array([stuck.own, stuck.own + TICK])).tolist()
+        then = np.array([stuck.time])
+        nearest = min(tracks, key=lambda track: float(np.linalg.norm(track.columns(then)[0] - ahead)))
+        return Blocked((self.members[number].name, self.members[nearest.number].name), (x, y), stuck.time)
 
 
-def _clock(
-    members: Sequence[FleetMember],
-    number: int,
-    tracks: list[_Track],
-    apart: float,
-    skew: float,
-    loss: LossModel | None,
-) -> Clock | Blocked:
-    """Return the fastest clock of a vehicle among the tracks of others."""
-    member = members[number]
-    trajectory = member.plan.trajectory
-    own = places(trajectory, cells_of(trajectory.duration))
-    if not tracks:
-        alone = Others(np.zeros((0, 1, 1, 2)), np.zeros((1, 1, LEVELS + 1), dtype=bool), STRIDE)
-        clock = fastest_clock(own, alone, apart)
-        assert isinstance(clock, Clock)
-        return clock
-    ticks = TICK * np.arange(int(np.ceil((max(track.end for track in tracks) + skew) / TICK)) + 2)
-    band = np.linspace(-skew, skew, 2 * int(np.ceil(skew / _BETWEEN_SKEWS)) + 1)
-    columns = np.stack([track.columns(ticks[:, None] + band) for track in tracks])
-    hazard = np.zeros((1, 1, LEVELS + 1), dtype=bool)
-    if loss is not None:
-        hazard = _hazard(own, number, tracks, ticks[::STRIDE], loss)
-    clock = fastest_clock(own, Others(columns, hazard, STRIDE), apart)
-    if isinstance(clock, Clock):
-        return clock
-    return _blocked(member, clock, own, tracks, members)
+def _distance_at_rest(members: Sequence[FleetMember]) -> float:
+    """Return the least distance, m, from start to start or from end to end."""
+    ends = np.stack([member.plan.path(np.array([0.0, member.plan.path.end]))[:, :2] for member in members])
+    return min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(ends, 2)), default=np.inf)
 
 
-def _hazard(own: NDArray, number: int, tracks: list[_Track], times: NDArray, loss: LossModel) -> NDArray:
-    """Return the hazard map of a vehicle at times of all, (T,) s."""
-    swept, passing = [], []
-    for track in tracks:
-        tube = loss.tubes[track.number]
-        rows = np.minimum(np.round(track.own(times) / loss.every).astype(int), len(tube) - 1)
-        swept.append(tube[rows])
-        passing.append(track.columns(times[:, None, None] + loss.braking))
-    rates = np.arange(LEVELS + 1) / LEVELS
-    return hazard_map(own, CELL, loss.tubes[number], np.stack(swept), np.stack(passing), loss, rates)
+def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation | None:
+    """Return the nearest approach to the tracks of others; None where there are none."""
+    found = [separations((made, track.member), skew)[0] for track in tracks if track.member]
+    return min(found, key=lambda each: each.distance, default=None)
 
 
-def _blocked(
-    member: FleetMember, stuck: Stuck, own: NDArray, tracks: list[_Track], members: Sequence[FleetMember]
-) -> Blocked:
-    here = own[round(stuck.own / CELL)]
-    ahead = own[min(round(stuck.own / CELL) + LEVELS, len(own) - 1)]
-    then = np.array([stuck.time])
-    nearest = min(tracks, key=lambda track: float(np.linalg.norm(track.columns(then)[0] - ahead)))
-    return Blocked((member.name, members[nearest.number].name), (float(here[0]), float(here[1])), stuck.time)
-
-
-def _with_clock(member: FleetMember, clock: Clock, apart: float) -> FleetMember | None:
-    """Return the member with a clock, planned again where that is slow; None where that is not possible."""
+def _with_clock(member: FleetMember, clock: Clock, apart: float, finish: Finish) -> FleetMember:
+    """Return the member with a clock, planned again where that is slow. Raises InfeasibleError."""
     if not clock.slows:
         return replace(member, delay=clock.delay)
     plan = member.plan
@@ -229,7 +230,4 @@ def _with_clock(member: FleetMember, clock: Clock, apart: float) -> FleetMember 
     allowed = allowed_speed(plan.limits.plan.speed, slower.caps if slower else None, s)
     caps = SpeedCaps.of(s, np.where(rate < 1.0, np.minimum(np.maximum(rate * speed, _LEAST_SPEED), allowed), allowed))
     reasons = dict.fromkeys((*(slower.reasons if slower else ()), f"staying {apart:.2f} m from the other vehicles"))
-    try:
-        return replace(member, plan=under_caps(plan, plan, caps, tuple(reasons)), delay=clock.delay)
-    except InfeasibleError:
-        return None
+    return replace(member, plan=finish(under_caps(plan, plan, caps, tuple(reasons))), delay=clock.delay)

@@ -8,7 +8,10 @@ The clocks of two vehicles differ by the skew at most, so every moment of one is
 within the skew. Between samples a vehicle moves no faster than its certified plan may, which is taken off.
 
 Joint stops need no samples of their own: each stop runs along the path by the same law of its clock, so vehicles that
-all brake at one tick pass pairs of places that are compared here, and rest at such a pair.
+all brake at one tick pass pairs of places that are compared here, and rest at such a pair. The order to brake may reach
+them at different times, which adds to the skew.
+
+A vehicle without poses or without its link leaves its path, and is not part of this certificate.
 """
 
 import itertools
@@ -38,7 +41,7 @@ class Separation:
     def __str__(self) -> str:
         a, b = self.pair
         x, y = self.place
-        return f"{a} and {b} come within {self.distance:.2f} m at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s"
+        return f"{a} and {b} {self.distance:.3f} m apart at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s"
 
     def keeps(self, apart: float) -> bool:
         """Return whether the two keep that distance, m."""
@@ -46,7 +49,7 @@ class Separation:
 
 
 def separations(members: Sequence[FleetMember], skew: float) -> tuple[Separation, ...]:
-    """Return the nearest approach of each pair, the nearest pair first, for clocks that differ by `skew`, s, at most."""
+    """Return the nearest approach of each pair, the nearest first, for clocks that differ by `skew`, s, at most."""
     end = max(member.end for member in members)
     times = np.arange(0.0, end + SAMPLE, SAMPLE)
     columns = [member.columns(times) for member in members]
@@ -54,11 +57,6 @@ def separations(members: Sequence[FleetMember], skew: float) -> tuple[Separation
     for i, j in itertools.combinations(range(len(members)), 2):
         found.append(_separation(members[i], members[j], columns[i], columns[j], skew))
     return tuple(sorted(found, key=lambda each: each.distance))
-
-
-def pair_separation(a: FleetMember, b: FleetMember, skew: float) -> Separation:
-    """Return the nearest approach of two vehicles."""
-    return separations((a, b), skew)[0]
 
 
 def _separation(a: FleetMember, b: FleetMember, of_a: NDArray, of_b: NDArray, skew: float) -> Separation:
@@ -76,6 +74,8 @@ def _nearest(a: NDArray, b: NDArray, band: int) -> tuple[float, int, int]:
     for n in range(len(a)):
         for m in range(max(n - band, 0), min(n + band + 1, len(b))):
             away = (a[n, 0] - b[m, 0]) ** 2 + (a[n, 1] - b[m, 1]) ** 2
-            if not away >= least:
+            if np.isnan(away):
+                return away, n, m
+            if away < least:
                 least, row, other = away, n, m
     return np.sqrt(least), row, other
