@@ -202,7 +202,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         InputError: a mistake in it or in the file that it names; names line and column.
     """
     file = pathlib.Path(file)
-    content, places = read_yaml_with_places(file, _Content)
+    content, places = read_yaml_with_places(file, _Content, lambda data: _of_one_vehicle(data, file))
     given = _source(content, places)
     through = given in ("waypoints", "points")
     _check_choice(content, places, given, through)
@@ -230,6 +230,17 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         regions=_regions(content, len(waypoints)) if through else (),
         corridor=content.corridor,
     ).placed(*content.place.motion)
+
+
+def _of_one_vehicle(data: dict[str, Any], file: pathlib.Path) -> dict[str, Any]:
+    """Return the data, or raise InputError where they are those of a fleet file."""
+    if "vehicles" in data:
+        raise InputError(
+            "a fleet file, where the path of one vehicle is needed",
+            where=str(file),
+            hint="`cfplan plan`, `check` and `sim` take fleets; the others take the path file of one vehicle",
+        )
+    return data
 
 
 def _check_choice(content: _Content, places: Places, given: str, through: bool) -> None:

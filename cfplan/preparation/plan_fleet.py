@@ -15,8 +15,11 @@ from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
+from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
+from cfplan.simulation.dry_run import DryRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +96,15 @@ def plan_fleet(
         results.append(f"{fleet.name}, {len(fleet.vehicles)} vehicles, {fleet.apart:g} m apart")
     alone = []
     for vehicle in fleet.vehicles:
-        planned = plan_flight(vehicle.path_file, limits, options)
         with step(on_step, vehicle.name) as results:
-            results.append(f"{planned.path_file and planned.path_file.name}, {planned.duration:.2f} s alone")
-            if planned.plan.slowing:
-                results.append(planned.plan.describe_slowing())
-        alone.append(FleetMember(vehicle.name, planned.plan))
+            try:
+                plan = plan_flight(vehicle.path_file, limits, options).plan
+            except InfeasibleError as error:
+                raise InfeasibleError(f"{vehicle.name}: {error.what}", where=error.where, hint=error.hint) from None
+            results.append(f"{vehicle.path_file.name}, {plan.trajectory.duration:.2f} s alone")
+            if plan.slowing:
+                results.append(plan.describe_slowing())
+        alone.append(FleetMember(vehicle.name, plan))
     return coordinate_fleet(fleet.name, alone, limits, (fleet.apart, fleet.skew), on_step)
 
 
@@ -137,3 +143,19 @@ def coordinate_fleet(
 
 def _given_way(plan: Plan) -> Plan:
     return give_way(plan)[0]
+
+
+def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[str, DryRun]:
+    """Encode and rehearse each vehicle's flight, and lose its link at every setpoint; return the dry runs by name.
+
+    Raises NotCertifiedError where bytes, dry run or link loss do not pass. No vehicle is simulated in another's wash.
+    """
+    dry_runs = {}
+    for flight in fleet.flights:
+        with step(on_step, flight.name) as results:
+            encoded = encode_flight(flight)
+            dry_runs[flight.name] = rehearse(flight, encoded)
+            results.append(f"{len(encoded.payloads)} setpoints, deviation {dry_runs[flight.name].expected()}")
+            lost = find_link_loss(encoded, fleet.limits)
+            (results.append if inside(lost.beyond) else results.warn)(str(lost))
+    return dry_runs
