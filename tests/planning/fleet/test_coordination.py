@@ -36,7 +36,9 @@ def crossing(member):
     return (
         member("east", (low, 0, 1), (high, 0, 1)),
         member("north", (0, low, 1.2), (0, high, 1.2)),
-        member("aslant", (low, low, 0.8), (high, high, 0.8)),
+        member(
+            "aslant", (low / math.sqrt(2), low / math.sqrt(2), 0.8), (high / math.sqrt(2), high / math.sqrt(2), 0.8)
+        ),
     )
 
 
