@@ -31,16 +31,19 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
 
 
 @pytest.mark.parametrize(
-    ("words", "what"),
-    [(("plan", "-o", "a.parquet"), "no plan file"), (("fly",), "not flown yet"), (("export",), "a fleet file")],
+    ("command", "words", "what"),
+    [
+        ("plan", ["-o", "a.parquet"], "no plan file"),
+        ("fly", ["--records", "."], "not flown yet"),
+        ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
+    ],
 )
-def test_what_is_of_one_vehicle_refuses_a_fleet(cfplan, fleet_file, safety_file, tmp_path, words, what):
-    command, *rest = words
-    if command == "export":
-        rest = ["-o", tmp_path / "out.csv"]
-    elif command == "fly":
-        rest = ["--records", tmp_path]
-    ended = cfplan(command, fleet_file, "--safety", safety_file(), *rest)
+def test_what_is_of_one_vehicle_refuses_a_fleet(
+    cfplan, fleet_file, safety_file, tmp_path, monkeypatch, command, words, what
+):
+    monkeypatch.chdir(tmp_path)
+    ended = cfplan(command, fleet_file, "--safety", safety_file(), *words)
     assert ended.code == 2
     assert what in ended.err
     assert "hint" in ended.err
+    assert not [file for file in tmp_path.iterdir() if file.suffix in (".parquet", ".csv")]

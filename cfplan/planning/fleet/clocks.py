@@ -20,7 +20,7 @@ RAMP = 6  # ticks from one rate to the next: 1.04 /s, which from 2 m/s brakes by
 _START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8  # how a state is reached: from rest, at the same, a lower, a higher rate
 
 
-class Clock(NamedTuple):
+class VehicleClock(NamedTuple):
     """A clock of a vehicle, from the fleet's start to the end of its path."""
 
     own: NDArray  # (N,) int, cells of its plan's own time at each tick
@@ -54,7 +54,7 @@ def cells_of(duration: float) -> NDArray:
     return CELL * np.arange(int(np.ceil(duration / CELL)) + LEVELS)
 
 
-def fastest_clock(own: NDArray, others: NDArray, apart: float) -> Clock | Stuck:
+def fastest_clock(own: NDArray, others: NDArray, apart: float) -> VehicleClock | Stuck:
     """Return the clock that reaches the end soonest, `apart`, m, from all others.
 
     `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan; `others`, (K, T, W, 2) m, are those of K
@@ -63,7 +63,7 @@ def fastest_clock(own: NDArray, others: NDArray, apart: float) -> Clock | Stuck:
     conflict = _conflicts(own, others, apart)
     how, end, cell, level = _reached(conflict)
     if level > 0:
-        return Clock(*_followed(how, end, cell, level))
+        return VehicleClock(*_followed(how, end, cell, level))
     found = how.any(axis=2)
     farthest = int(np.flatnonzero(found.any(axis=0)).max(initial=0))
     return Stuck(CELL * farthest, TICK * float(np.flatnonzero(found[:, farthest]).max(initial=0)))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.random_paths import generator
-from cfplan.planning.fleet.clocks import CELL, TICK, Clock, Stuck, cells_of, fastest_clock
+from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_of, fastest_clock
 from cfplan.planning.fleet.members import FleetMember, places
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
@@ -53,7 +53,7 @@ class _Track:
 
     number: int
     base: Trajectory  # the plan before coordination
-    clock: Clock | None  # its clock, as sketched
+    clock: VehicleClock | None  # its clock, as sketched
     member: FleetMember | None = None  # the flight, as made
 
     @property
@@ -182,7 +182,7 @@ class _Search:
         assert blocked is not None
         return blocked
 
-    def _clock(self, number: int, tracks: list[_Track], slack: float) -> Clock | Blocked:
+    def _clock(self, number: int, tracks: list[_Track], slack: float) -> VehicleClock | Blocked:
         """Return the fastest clock of a vehicle among the tracks of others."""
         trajectory = self.members[number].plan.trajectory
         own = places(trajectory, cells_of(trajectory.duration))
@@ -194,7 +194,7 @@ class _Search:
         for row, track in zip(others, tracks, strict=True):
             row[:] = track.columns(ticks[:, None] + band)
         clock = fastest_clock(own, others, min(self.apart + slack, max(self.at_rest, self.apart)))
-        return clock if isinstance(clock, Clock) else self._blocked(number, clock, tracks)
+        return clock if isinstance(clock, VehicleClock) else self._blocked(number, clock, tracks)
 
     def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
         """Return where a vehicle is stuck, and which of the others is nearest to where it would go."""
@@ -217,7 +217,7 @@ def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation
     return min(found, key=lambda each: each.distance, default=None)
 
 
-def _with_clock(member: FleetMember, clock: Clock, apart: float, finish: Finish) -> FleetMember:
+def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:
     """Return the member with a clock, planned again where that is slow. Raises InfeasibleError."""
     if not clock.slows:
         return replace(member, delay=clock.delay)
