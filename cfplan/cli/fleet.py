@@ -18,6 +18,16 @@ def is_fleet(file: Path) -> bool:
     return is_fleet_file(file)
 
 
+def refuse_flight(file: Path) -> None:
+    """Raise InputError for a fleet file."""
+    if is_fleet(file):
+        raise InputError(
+            "fleets are planned and checked, but not flown yet",
+            where=str(file),
+            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
+        )
+
+
 def refuse_output(output: Path | None, figure: Path | None) -> None:
     """Raise InputError for output files, each of which holds the plan of one vehicle."""
     if output is not None or figure is not None:

@@ -104,12 +104,7 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    if fleet.is_fleet(path_or_plan):
-        raise InputError(
-            "fleets are planned and checked, but not flown yet",
-            where=str(path_or_plan),
-            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
-        )
+    fleet.refuse_flight(path_or_plan)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
@@ -119,7 +114,6 @@ def fly(
         prepare = _preparation(on_board, after, planning, uri)
         prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
-            click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
         flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, flown, as_json)
@@ -140,7 +134,7 @@ def _preparation(
     if not after:
         return prepare
     _require_no_new_plan(planning)
-    return partial(_prepare_again, prepare, after, on_board, uri)
+    return partial(_prepare_again, prepare, after, on_board=on_board, uri=uri)
 
 
 def _require_no_new_plan(planning: dict[str, Any]) -> None:
@@ -156,8 +150,8 @@ def _require_no_new_plan(planning: dict[str, Any]) -> None:
 
 
 def _prepare_again(
-    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], on_board: bool, uri: str,
-    path_or_plan: Path, limits: "Limits", flight_options: "FlightOptions", steps: Steps,
+    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], path_or_plan: Path, limits: "Limits",
+    flight_options: "FlightOptions", steps: Steps, *, on_board: bool, uri: str,
 ) -> "Prepared":  # fmt: skip
     """Prepare the plan of earlier flights, corrected by what repeated in them."""
     from cfplan.identification.earlier_flights import earlier_flights, learn_correction
