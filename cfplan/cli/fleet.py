@@ -32,9 +32,9 @@ def refuse_output(output: Path | None, figure: Path | None) -> None:
     """Raise InputError for output files, each of which holds the plan of one vehicle."""
     if output is not None or figure is not None:
         raise InputError(
-            "a fleet has no plan file and no figure",
+            "plan files and figures are not supported for fleets",
             where=str(output or figure),
-            hint="leave -o and --figure out; --json prints starts, ends and distances",
+            hint="omit -o and --figure; --json prints starts, ends and distances",
         )
 
 

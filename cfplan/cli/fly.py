@@ -144,7 +144,7 @@ def _require_no_new_plan(planning: dict[str, Any]) -> None:
     chosen += ["--planner"] if planning["planner"] != "auto" else []
     if chosen:
         raise InputError(
-            f"{chosen[0]} asks for a new plan, and --after flies that of the records", where="--after",
+            f"{chosen[0]} needs a new plan, but --after flies the plan of the records", where="--after",
             hint="leave one of them out",
         )  # fmt: skip
 
@@ -161,7 +161,7 @@ def _prepare_again(
         learned = learn_correction(earlier.flights)
         results.append(learned.describe())
         if earlier.uri != uri:
-            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle strays otherwise")
+            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle deviates differently")
     prepared = prepare(earlier.plan_file, limits, replace(flight_options, correction=learned.correction), steps)
     return replace(prepared, planned=replace(prepared.planned, name=earlier.name))
 
@@ -170,7 +170,7 @@ def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board:
     """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
     if after and lines is not None:
         raise InputError(
-            "waypoints that come in the air make a new plan", where="--after", hint="name the path of the records"
+            "waypoints received in flight make a new plan", where="--after", hint="name the path of the records"
         )
     if on_board and lines is not None:
         raise InputError(
