@@ -70,7 +70,7 @@ def test_without_a_weighed_mass_the_ratio_is_found_and_the_mass_held(record, dra
     found = identify([record])
     true, before = drawn.airframe, limits.airframe
     assert found.airframe.mass == before.mass
-    assert "weigh it" in found.quantities["mass"].untold
+    assert "weigh it" in found.quantities["mass"].unobservable_reason
     ratio = found.airframe.motor_thrust_max / found.airframe.mass
     assert ratio == pytest.approx(true.motor_thrust_max / true.mass, rel=0.012)
     assert found.airframe.drag[0] / before.mass == pytest.approx(true.drag[0] / true.mass, rel=0.08)
