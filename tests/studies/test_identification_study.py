@@ -9,7 +9,10 @@ import pytest
 from cfplan.vehicle.airframes import AIRFRAMES
 from studies.identification import STUDY, Settings, StudiedVehicle, draw_vehicle
 
-QUANTITIES = ("thrust", "thrust over mass", "mass", "motor lag", "drag", "axial drag", "pose latency")
+QUANTITIES = (
+    "thrust", "thrust over mass", "mass", "motor lag", "drag", "axial drag", "roll moment", "pitch moment",
+    "pose latency",
+)  # fmt: skip
 SETTINGS = Settings(Path("identify.yaml"), Path("figure8.yaml"))
 NOMINAL = AIRFRAMES["crazyflie-2.1+"]
 
@@ -46,6 +49,6 @@ def test_a_seed_draws_one_vehicle_near_the_nominal_one():
     assert first == again
     assert first.airframe != other.airframe
     assert abs(first.airframe.mass / NOMINAL.mass - 1.0) <= 0.1
-    drawn = ("mass", "motor_time_constant", "drag", "motor_thrust_max")
+    drawn = ("mass", "motor_time_constant", "drag", "thrust_scale", "velocity_moment")
     same = replace(first.airframe, **{name: getattr(NOMINAL, name) for name in drawn})
     assert same == NOMINAL

@@ -15,30 +15,27 @@ from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.dry_run import rehearse_motion
-from cfplan.vehicle.airframes import as_flown
 from cfplan.vehicle.joint import JoinedTrajectory
 
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
 
 
 @pytest.fixture(scope="module")
-def limits():
-    """The limits of the project's own safety.yaml."""
+def turned():
+    """The limits of the project's own safety.yaml, whose airframe the air turns."""
     return load_limits(Path(__file__).parents[3] / "safety.yaml")
+
+
+@pytest.fixture(scope="module")
+def limits(turned):
+    """The same without the moment."""
+    return replace(turned, airframe=replace(turned.airframe, velocity_moment=(0.0, 0.0)))
 
 
 @pytest.fixture(scope="module")
 def planned(limits):
     path = min_snap(WAYPOINTS, times=centripetal_times(WAYPOINTS))
     return plan(path, limits.airframe, limits, planner="expert").trajectory
-
-
-@pytest.fixture(scope="module")
-def turned(limits):
-    """Limits whose airframe the air turns as public flights show."""
-    moment = as_flown(limits.airframe).velocity_moment
-    assert min(moment) > 0.0
-    return replace(limits, airframe=replace(limits.airframe, velocity_moment=moment))
 
 
 def encoded(planned, limits):
