@@ -204,28 +204,6 @@ def fly_stepped(
     if scenario.planner is not None and timeline is not None:
         planner = SteppedPlanner(timeline, mission.limits, lab.clock, flown.answers.append)
 
-    def strike() -> None:
-        flown.struck = lab.now
-        for fault in scenario.faults if not scenario.from_start else ():
-            lab.disturb(fault)
-        orders.worst = scenario.order
-        if planner is not None:
-            planner.fault = scenario.planner
-            planner.request(Wish.REPLACE, [ASKED])
-        if scenario.stall:
-            lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
-        if scenario.main_killed:
-            lab.clock.at(lab.now + scenario.main_killed_after, lambda: setattr(orders, "gone", True))
-        if scenario.pilot_killed:
-            lab.clock.at(lab.now + scenario.pilot_killed_after, kill)
-
-    def kill() -> None:
-        if flown.ended:
-            return
-        flown.killed = True
-        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # the pilot's cleanup code must not reach the vehicle
-        raise PilotKilled
-
     def hear(message: Telemetry) -> None:
         if flown.killed:
             return
@@ -238,7 +216,7 @@ def fly_stepped(
             if message.phase is Phase.LAND:
                 flown.landing = message.time
             if message.phase is scenario.phase and math.isnan(flown.struck):
-                lab.clock.at(message.time + scenario.moment, strike)
+                lab.clock.at(message.time + scenario.moment, lambda: _strike(scenario, lab, flown, orders, planner))
 
     if scenario.from_start:
         for fault in scenario.faults:
@@ -269,6 +247,33 @@ def fly_stepped(
         lab.clock.sleep(_AFTERWARDS)
         flown.truth = lab.truth()
     return flown
+
+
+def _strike(
+    scenario: Scenario, lab: SteppedLab, flown: SteppedFlight, orders: HeldOrders, planner: SteppedPlanner | None
+) -> None:
+    """Do now what a scenario does to a flight, or set it up for later."""
+
+    def kill() -> None:
+        if flown.ended:
+            return
+        flown.killed = True
+        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # the pilot's cleanup code must not reach the vehicle
+        raise PilotKilled
+
+    flown.struck = lab.now
+    for fault in scenario.faults if not scenario.from_start else ():
+        lab.disturb(fault)
+    orders.worst = scenario.order
+    if planner is not None:
+        planner.fault = scenario.planner
+        planner.request(Wish.REPLACE, [ASKED])
+    if scenario.stall:
+        lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
+    if scenario.main_killed:
+        lab.clock.at(lab.now + scenario.main_killed_after, lambda: setattr(orders, "gone", True))
+    if scenario.pilot_killed:
+        lab.clock.at(lab.now + scenario.pilot_killed_after, kill)
 
 
 def _lab(scenario: Scenario, mission: Mission, seed: int) -> SteppedLab:

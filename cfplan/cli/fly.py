@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from cfplan.cli import options
+from cfplan.cli.fly_waypoints import fly_waypoints
 from cfplan.cli.output import Steps, print_json, print_table, styled
 from cfplan.errors import ExitCode, InputError
 
@@ -88,7 +89,8 @@ def fly(
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
-        return _steer(path_or_plan, lines, on_board, safety_file, uri, mocap_uri, records, watched, yes, as_json)
+        place = _source_of_waypoints(path_or_plan, lines, on_board)
+        return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
@@ -116,9 +118,8 @@ def _preparation(on_board: bool) -> "Callable[..., Prepared]":
     return prepare_flight
 
 
-def _steer(path_or_plan: Path | None, lines: str | None, on_board: bool, *flight: Any) -> int:
-    from cfplan.cli.fly_waypoints import fly_waypoints
-
+def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool) -> str:
+    """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
     if on_board and lines is not None:
         raise InputError(
             "waypoints that come in the air are streamed", where="--on-board", hint="name a path, or leave it out"
@@ -129,7 +130,7 @@ def _steer(path_or_plan: Path | None, lines: str | None, on_board: bool, *flight
             where=str(path_or_plan or "cfplan fly"),
             hint="name a path file, or --example figure8, or give --waypoints -",
         )
-    return fly_waypoints(lines, *flight)
+    return lines
 
 
 def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) -> None:

@@ -48,6 +48,7 @@ def fly_waypoints(
     mocap_uri: str | None,
     records: Path,
     watched: "Watched",
+    *,
     yes: bool,
     as_json: bool,
 ) -> int:

@@ -49,7 +49,9 @@ def fly_and_record(
     progress = FlightProgress(duration=prepared.mission.duration, steps=steps)
     with Keyboard() as keyboard:  # until the summary is written: Ctrl-C during landing must not end the program
         try:
-            outcome, failures = _fly_into(folder, prepared, source, vehicle, pose_source, watched, progress, keyboard)
+            outcome, failures = _fly_into(
+                folder, prepared, source, vehicle, watched, poses=pose_source, progress=progress, keyboard=keyboard
+            )
         except CfplanError:
             if progress.heard_vehicle:
                 steps.say(f"what was recorded: {folder}")
@@ -71,8 +73,9 @@ def _fly_into(
     prepared: Prepared,
     source: Path,
     vehicle: StartingVehicle,
-    pose_source: PoseSource,
     watched: Watched,
+    *,
+    poses: PoseSource,
     progress: FlightProgress,
     keyboard: Keyboard,
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
@@ -90,7 +93,7 @@ def _fly_into(
         outcome = fly(
             prepared.mission,
             uri=uri,
-            pose_source=pose_source,
+            pose_source=poses,
             pilot=vehicle.pilot,
             on_telemetry=_for_all(writer.write, progress.show, *watching.listeners),
             more_orders=watching.orders,

@@ -89,7 +89,7 @@ def validate(
 
 
 def _read(
-    place: Path, gains: Path | None, polynomials: Path | None, time_scale: float, plan: Path | None,
+    place: Path, *, gains: Path | None, polynomials: Path | None, time_scale: float, plan: Path | None,
     offset: tuple[float, float, float] | None, mass: float | None, vehicle: str | None, begin: float, end: float,
 ) -> "LoggedFlight":  # fmt: skip
     """Return a flight, its reference begun as flown. One parameter per option of the command."""

@@ -3,12 +3,14 @@
 Setpoints, dry run and link loss rest on these figures, so preflight reads back what of them a vehicle can tell.
 """
 
+import math
 import re
 from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import Airframe
 
 NEWEST_KNOWN = (2026, 8)  # the newest firmware that these figures were read from
@@ -69,10 +71,9 @@ class Timeouts:
         """Return when, s after the last setpoint, the vehicle levels out at the latest."""
         return self.level_out + self.period
 
-    @property
-    def motors_off_at_latest(self) -> float:
-        """Return when, s after the last setpoint, the motors stop at the latest."""
-        return self.motors_off + self.period
+    def motors_off_at_latest(self, watchdog: bool) -> float:
+        """Return when, s after the last packet, the motors stop at the latest, with the watchdog or without it."""
+        return self.watchdog_at_latest if watchdog else self.motors_off + self.period
 
     @property
     def watchdog_at_latest(self) -> float:
@@ -93,6 +94,28 @@ EARLIER_DEVIATIONS: tuple[tuple[tuple[int, ...], str], ...] = (
     (YAW_CORRECT, "8 to 13 cm, and 2 cm low"),
     ((2025, 12), "5 to 9 cm"),
 )
+
+ATTITUDE_ERROR_WITHOUT_DRAG = math.radians(3.5)  # rad, of a filter that knows no drag; results/blind-link-loss.json
+VELOCITY_ERROR_WITHOUT_DRAG = 0.3  # m/s, likewise
+
+
+def knows_drag(limits: Limits) -> bool:
+    """Return whether every vehicle that may fly has a filter that can be told of rotor drag.
+
+    Before a vehicle is connected, safety.yaml alone says what firmware it may have.
+    """
+    return limits.firmware.oldest >= FLIES_AS_PREDICTED
+
+
+def estimate_errors(limits: Limits) -> tuple[float, float]:
+    """Return the errors of the estimated attitude, rad, and velocity, m/s, to allow for when link and poses are lost.
+
+    They are those of safety.yaml, and no less than those of the oldest firmware that may fly.
+    """
+    stated = limits.link_loss.attitude_error, limits.link_loss.velocity_error
+    if knows_drag(limits):
+        return stated
+    return max(stated[0], ATTITUDE_ERROR_WITHOUT_DRAG), max(stated[1], VELOCITY_ERROR_WITHOUT_DRAG)
 
 
 def earlier_deviation(version: tuple[int, ...]) -> str:

@@ -83,7 +83,7 @@ def assess_link_loss_of_stops(
         if not asked.any():
             break
         about, done = (
-            _about(_sample(sampled, asked, encoded, limits, plan, margin, made) > -near, every, each),
+            _about(_sample(sampled, asked, made, encoded, limits, plan, margin=margin) > -near, every, each),
             done | asked,
         )
     faces = limits.space.faces
@@ -114,11 +114,12 @@ class _Sampled:
 def _sample(
     sampled: _Sampled,
     asked: NDArray,
+    made: Callable[[NDArray], NDArray],
     encoded: EncodedFlight,
     limits: Limits,
     plan: LinkLossMoments,
+    *,
     margin: float,
-    made: Callable[[NDArray], NDArray],
 ) -> NDArray:
     """Lose the link in the stops from the setpoints and after the rows that are `asked`, (N, M).
 

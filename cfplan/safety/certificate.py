@@ -156,7 +156,7 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
     state = trajectory.at(time)
     measured = measures_of(
         state.velocity, state.acceleration, state.body_rate, state.thrust_axis, state.specific_thrust,
-        state.angular_acceleration, state.motor_thrust,
+        angular_acceleration=state.angular_acceleration, motor_thrust=state.motor_thrust,
     )  # fmt: skip
     bounds, _ = _bounds(trajectory.airframe, limits, None)
     return {q.name: (q.worst(measured) - unused) / (limit - unused) for q, limit, unused in bounds}

@@ -361,7 +361,7 @@ def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
     beyond = np.repeat(np.where(close, -np.inf, most).max(axis=1)[:, None], count, axis=1)
     piece, obstacle = np.nonzero(close)
     cell = piece[:, None] * count + np.arange(count)
-    stretches = _cut(path, space, prisms, bend, cell[:, :-1], piece, obstacle, s[piece])
+    stretches = _cut(path, space, prisms, s[piece], cell=cell[:, :-1], piece=piece, obstacle=obstacle, bend=bend)
     reached = seen.max()
     for level in range(_LEVELS):
         reached = max(reached, stretches.least.max(initial=-np.inf))
@@ -373,7 +373,7 @@ def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
         coarse = stretches.some(open_)
         nodes = coarse.ends[:, :1] + np.diff(coarse.ends, axis=1) * np.linspace(0.0, 1.0, _PARTS + 1)
         cell = np.repeat(coarse.cell[:, None], _PARTS, axis=1)
-        stretches = _cut(path, space, prisms, bend, cell, coarse.piece, coarse.obstacle, nodes)
+        stretches = _cut(path, space, prisms, nodes, cell=cell, piece=coarse.piece, obstacle=coarse.obstacle, bend=bend)
     at[:, -1], beyond[:, -1] = at[:, -2], beyond[:, -2]
     for each in (at, beyond):
         each.setflags(write=False)
@@ -384,11 +384,12 @@ def _cut(
     path: Path,
     space: Space,
     prisms: _Prisms,
-    bend: NDArray,
+    nodes: NDArray,
+    *,
     cell: NDArray,
     piece: NDArray,
     obstacle: NDArray,
-    nodes: NDArray,
+    bend: NDArray,
 ) -> _Stretches:
     """Return the stretches between nodes, (P, n) s, for `cell`, (P, n - 1), beside the obstacle of each row."""
     places = path(nodes)

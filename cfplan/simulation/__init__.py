@@ -1,6 +1,7 @@
 """Simulated flight: the simulator's engine, the virtual Crazyflie and Vicon, the lab, the dry run and link loss."""
 
 __all__ = [
+    "draws",
     "dry_run",
     "engine",
     "geometric_flight",

@@ -9,6 +9,7 @@ In the air there is no time for that. There one vehicle, as its airframe says an
 where the simulated one is: rehearse_motion() and rehearse_setpoints().
 """
 
+import math
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.firmware import FLIES_AS_PREDICTED, gains_for
+from cfplan.flight.firmware import Timeouts, gains_for, knows_drag
 from cfplan.flight.pilot.vehicle_rules import EXTERNAL_ATTITUDE_STD, EXTERNAL_POSITION_STD
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
@@ -129,15 +130,17 @@ class Rehearsed:
 
 def dry_run(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: Limits) -> DryRun:
     """Fly the payloads on vehicles drawn about the airframe of the limits; compare with `trajectory`."""
-    rows = setpoint_rows(decode(encoded.payloads))
-    yaw, duration = float(trajectory.at(0.0).yaw), encoded.duration + SETTLING
+    return rehearse_draws(rehearsed_flight(encoded, trajectory), limits)
+
+
+def rehearsed_flight(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory) -> Rehearsed:
+    """Return the flight of an encoded trajectory, to be flown by drawn vehicles."""
+    rows, yaw = setpoint_rows(decode(encoded.payloads)), float(trajectory.at(0.0).yaw)
 
     def wanted_at(times: NDArray) -> NDArray:
         return np.asarray(trajectory.at(times).position)
 
-    return rehearse_draws(
-        Rehearsed(rows, encoded.times, yaw, wanted_at, trajectory.duration, duration), limits
-    )  # fmt: skip
+    return Rehearsed(rows, encoded.times, yaw, wanted_at, trajectory.duration, encoded.duration + SETTLING)
 
 
 def rehearse_draws(flight: Rehearsed, limits: Limits) -> DryRun:
@@ -164,8 +167,11 @@ def rehearse_draws(flight: Rehearsed, limits: Limits) -> DryRun:
     return replace(run, real_time_factor=flight.duration / (time.perf_counter() - begun))
 
 
-def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits) -> ClosedLoop:
-    """Fly on a drawn vehicle, whose controller and filter are told what the pilot tells them."""
+def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.inf) -> ClosedLoop:
+    """Fly on a drawn vehicle, whose controller and filter are told what the pilot tells them.
+
+    After `lost`, s, neither setpoints nor poses are sent, and its supervisor levels it out and stops its motors.
+    """
     told, drawn = limits.airframe, draw.airframe
     gains = gains_for(told)
     # Hover has lasted too short for the controller's integral, of some 25 s, to take off what weight and thrust are
@@ -173,7 +179,9 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits) -> ClosedLoop:
     sunk = GRAVITY * (drawn.mass * told.thrust_scale / drawn.thrust_scale - told.mass) / gains.kp_z
     start = hovering(drawn, flight.wanted_at(np.zeros(1))[0] - [0.0, 0.0, sunk], flight.yaw)
     steps = round(flight.duration / TIME_STEP) + 1
-    arrivals = np.arange(draw.pose_phase, flight.duration + TIME_STEP, 1.0 / limits.pose.rate)
+    arrivals = np.arange(draw.pose_phase, min(flight.duration + TIME_STEP, lost), 1.0 / limits.pose.rate)
+    sent = flight.times <= lost
+    alone = flight.times[sent][-1] + RADIO if lost < math.inf else math.inf
     noise = np.random.default_rng(draw.seed).normal(size=(len(arrivals), 6))
     noise *= np.repeat([limits.pose.position_noise, limits.pose.attitude_noise], 3)
     drag = told.drag[0] / told.mass if knows_drag(limits) else 0.0
@@ -182,19 +190,13 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits) -> ClosedLoop:
         attitude_deviation=EXTERNAL_ATTITUDE_STD, drag=(drag, drag, 0.0), noise=noise,
     )  # fmt: skip
     flown = fly_with_estimator(
-        gains, flight.setpoints, flight.times + RADIO, drawn, start[:13], poses,
+        gains, flight.setpoints[sent], flight.times[sent] + RADIO, drawn, start[:13], poses,
         scale=np.full(steps, drawn.thrust_scale), mode=flight.mode,
+        level_at=alone + Timeouts().level_out_at_latest,
+        off_at=alone + Timeouts().motors_off_at_latest(limits.firmware.watchdog),
     )  # fmt: skip
     commands = flown.asked * (FULL_COMMAND / told.motor_thrust_max)
     return ClosedLoop(np.arange(steps) * TIME_STEP, flown.states, commands)
-
-
-def knows_drag(limits: Limits) -> bool:
-    """Return whether every vehicle that may fly has a filter that can be told of rotor drag.
-
-    Before a vehicle is connected, safety.yaml alone says what firmware it may have.
-    """
-    return limits.firmware.oldest >= FLIES_AS_PREDICTED
 
 
 def rehearse_motion(

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import gains_for
+from cfplan.flight.firmware import estimate_errors, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.safety.limits import Limits
@@ -95,7 +95,7 @@ def glitch_at_sampled_setpoints(
 
 def _wanted(count: int, limits: Limits) -> NDArray:
     """Return (3, N) bool: the KINDS of gap to simulate at each setpoint; an exact estimate needs no gaps in poses."""
-    blind = _every(count, WITHOUT_POSES_EVERY) & (limits.link_loss.attitude_error > 0.0)
+    blind = _every(count, WITHOUT_POSES_EVERY) & (estimate_errors(limits)[0] > 0.0)
     return np.stack([np.ones(count, dtype=bool), blind, blind])
 
 
@@ -161,7 +161,7 @@ def _gaps(flight: _Flight, wanted: NDArray, limits: Limits, gap: float) -> NDArr
     snapshots, milliseconds = flight.snapshots[number], round(1000 * gap)
     speed = np.linalg.norm(snapshots[:, 3:5], axis=1, keepdims=True)
     ahead = np.where(speed > 0.0, snapshots[:, 3:5] / np.where(speed > 0.0, speed, 1.0), (1.0, 0.0))
-    push = GRAVITY * math.tan(limits.link_loss.attitude_error) * (kind != 0)[:, None]
+    push = GRAVITY * math.tan(estimate_errors(limits)[0]) * (kind != 0)[:, None]
     batch = Vehicles(
         snapshots, np.tile(pack_airframe(limits.airframe, floor=NO_FLOOR), (len(kind), 1)), number,
         np.full(len(kind), len(flight.rows) - 1), np.where(kind == 1, 0, milliseconds),

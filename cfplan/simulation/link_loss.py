@@ -24,7 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import Timeouts, gains_for
+from cfplan.flight.firmware import Timeouts, estimate_errors, gains_for
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, decode
 from cfplan.safety.limits import Limits
@@ -40,8 +40,7 @@ from cfplan.simulation.engine.run import NEVER, Schedule, Vehicles, arrival_time
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
-LEVEL_AFTER, OFF_AFTER = Timeouts().level_out_at_latest, Timeouts().motors_off_at_latest
-OFF_BY_WATCHDOG = Timeouts().watchdog_at_latest  # if the emergency-stop watchdog is enabled
+LEVEL_AFTER = Timeouts().level_out_at_latest
 _PARTS = 9  # boxes of a sweep, if there are obstacles
 _STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
 _LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
@@ -288,7 +287,7 @@ def _swept(forks: _Forks, limits: Limits) -> NDArray:
 
 def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
     """Fly on with the last setpoints; the accelerometer reads `error`, m/s², too little."""
-    off, step = OFF_BY_WATCHDOG if limits.firmware.watchdog else OFF_AFTER, forks.step
+    off, step = Timeouts().motors_off_at_latest(limits.firmware.watchdog), forks.step
     level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
     return _leave(forks, limits, error, _alone(forks, limits)._replace(
         level_after=level, off_after=off, spread=_drift(limits, off, step)
@@ -323,11 +322,12 @@ def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> N
 
 def _drift(limits: Limits, off: int, step: int) -> NDArray:
     """Return the drift to a side through errors of attitude and velocity, after each step, m."""
-    wrong, airframe = limits.link_loss, limits.airframe
-    push, damping = GRAVITY * math.tan(wrong.attitude_error), max(airframe.drag[0] / airframe.mass, 1e-6)
+    attitude_error, velocity_error = estimate_errors(limits)
+    airframe = limits.airframe
+    push, damping = GRAVITY * math.tan(attitude_error), max(airframe.drag[0] / airframe.mass, 1e-6)
     time = 0.001 * step * np.arange(_LONGEST // step + 1)
     powered, alone = np.minimum(time, 0.001 * off), np.maximum(time - 0.001 * off, 0.0)
-    speed = wrong.velocity_error * np.exp(-damping * powered) - push * np.expm1(-damping * powered) / damping
+    speed = velocity_error * np.exp(-damping * powered) - push * np.expm1(-damping * powered) / damping
     speed *= np.exp(-damping * alone)
     return np.asarray(np.cumsum(0.5 * (speed[:-1] + speed[1:])) * 0.001 * step)
 

@@ -89,7 +89,7 @@ def recertify(record: Record) -> Recertified:
             jump = max(jump, _jump(timeline.for_plans_from(splice, limits), joint_of(splice), plan))
             limits = plan.limits
         told, checksum = commitments.payloads[number], int(commitments.checksum[number])
-        made = _committed(timeline, splice, plan, limits, told, checksum, number)
+        made = _committed(timeline, splice, plan, limits, told, checksum=checksum, number=number)
         begins = int(commitments.splice[number:].min())  # no other plan leaves before that setpoint
         timeline = made.accepted(spliced(timeline.commitment, made.proposal, begins))
         stops += timeline.stopping
@@ -143,7 +143,7 @@ def _jump(timeline: Timeline, joint: float, plan: Plan) -> float:
 
 
 def _committed(
-    timeline: Timeline, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, checksum: int, number: int
+    timeline: Timeline, splice: int, plan: Plan | None, limits: Limits, payloads: bytes, *, checksum: int, number: int
 ) -> Replanned:
     """Certify a plan again, or another part of it, and return it.
 

@@ -118,38 +118,62 @@ def flat_state(
     psi_dt = speed * psi_ds
     psi_ddt = h0 * psi_dds + 0.5 * h1 * psi_ds
 
-    (a, b, c), (a1, b1, c1), (a2, b2, c2) = axis, axis_dt, axis_ddt
+    heading = cos(psi), sin(psi)
+    body_rate, angular_acceleration = _turning((axis, axis_dt, axis_ddt), heading, (psi_dt, psi_ddt))
+    torque = _torque(airframe, body_rate, angular_acceleration, _velocity_across(axis, heading, velocity))
+    motor_thrust = motor_thrusts(airframe, airframe.mass * specific_thrust, torque)
+    return Flat(
+        velocity, acceleration, jerk, snap, specific_thrust, axis, body_rate, angular_acceleration, torque, motor_thrust
+    )
+
+
+@_within_the_loop
+def _turning(
+    axes: tuple[Vector, Vector, Vector], heading: tuple[Scalar, Scalar], turn: tuple[Scalar, Scalar]
+) -> tuple[Vector, Vector]:
+    """Return body rate and angular acceleration.
+
+    `axes` are the thrust axis and its first two derivatives in time, `heading` is (cos ψ, sin ψ) and `turn` those of ψ.
+    """
+    (a, b, c), (a1, b1, c1), (a2, b2, c2) = axes
+    (cos_psi, sin_psi), (psi_dt, psi_ddt) = heading, turn
     lift = 1.0 / (1.0 + c)
     p = a1 - a * c1 * lift
     r = b1 - b * c1 * lift
     p_dt = a2 - (a1 * c1 + a * c2) * lift + a * c1 * c1 * lift * lift
     r_dt = b2 - (b1 * c1 + b * c2) * lift + b * c1 * c1 * lift * lift
-    cos_psi, sin_psi = cos(psi), sin(psi)
     wx = p * sin_psi - r * cos_psi
     wy = p * cos_psi + r * sin_psi
     wz = (b * a1 - a * b1) * lift + psi_dt
-    body_rate = (wx, wy, wz)
-    angular_acceleration = (
+    return (wx, wy, wz), (
         p_dt * sin_psi - r_dt * cos_psi + psi_dt * wy,
         p_dt * cos_psi + r_dt * sin_psi - psi_dt * wx,
         (b * a2 - a * b2) * lift - (b * a1 - a * b1) * c1 * lift * lift + psi_ddt,
     )
 
-    # The air turns the body in proportion to its velocity along x and y; before the turn by yaw these are
+
+@_within_the_loop
+def _velocity_across(axis: Vector, heading: tuple[Scalar, Scalar], velocity: Vector) -> tuple[Scalar, Scalar]:
+    """Return the velocity along body x and y."""
+    a, b, c = axis
+    lift = 1.0 / (1.0 + c)
     first = velocity[0] - a * (velocity[2] + lift * (a * velocity[0] + b * velocity[1]))
     second = velocity[1] - b * (velocity[2] + lift * (a * velocity[0] + b * velocity[1]))
-    along, across = cos_psi * first + sin_psi * second, cos_psi * second - sin_psi * first
-    about_x, about_y = airframe.velocity_moment
+    cos_psi, sin_psi = heading
+    return cos_psi * first + sin_psi * second, cos_psi * second - sin_psi * first
 
+
+@_within_the_loop
+def _torque(
+    airframe: Airframe | Body, body_rate: Vector, angular_acceleration: Vector, velocity: tuple[Scalar, Scalar]
+) -> Vector:
+    """Return the torque of the motors, N m, beside the moment of the air, which is as the velocity along body x, y."""
     jx, jy, jz = airframe.inertia
-    torque = (
-        jx * angular_acceleration[0] + (jz - jy) * wy * wz - about_x * across,
-        jy * angular_acceleration[1] + (jx - jz) * wz * wx + about_y * along,
+    (wx, wy, wz), (about_x, about_y) = body_rate, airframe.velocity_moment
+    return (
+        jx * angular_acceleration[0] + (jz - jy) * wy * wz - about_x * velocity[1],
+        jy * angular_acceleration[1] + (jx - jz) * wz * wx + about_y * velocity[0],
         jz * angular_acceleration[2] + (jy - jx) * wx * wy,
-    )
-    motor_thrust = motor_thrusts(airframe, airframe.mass * specific_thrust, torque)
-    return Flat(
-        velocity, acceleration, jerk, snap, specific_thrust, axis, body_rate, angular_acceleration, torque, motor_thrust
     )
 
 

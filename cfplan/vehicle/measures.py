@@ -57,6 +57,7 @@ def measures_of(
     body_rate: NDArray,
     thrust_axis: NDArray,
     specific_thrust: NDArray,
+    *,
     angular_acceleration: NDArray | None = None,
     motor_thrust: NDArray | None = None,
 ) -> NDArray:

@@ -27,6 +27,7 @@ from cfplan.simulation.link_loss import (
     simulate_link_loss,
 )
 from cfplan.vehicle.airframe import GRAVITY
+from studies.blind_link_loss import measure as lose_link_and_poses
 from studies.fault_scenarios import SCENARIOS
 from studies.faults import fly_stepped
 
@@ -303,3 +304,11 @@ def test_the_virtual_crazyflie_goes_there_too(line, limits):
         lag = limits.airframe.motor_time_constant
         on = fly_on(line.payloads, limits.airframe, row, lag=lag, off_after=1040)
         assert alone[-1] == pytest.approx(on[-1], abs=0.2)
+
+
+@pytest.mark.parametrize("told_of_drag", ["yes", "no"])
+def test_a_vehicle_that_flies_on_its_estimate_comes_down_near_the_swept_box(told_of_drag):
+    """Without the allowances of firmware that knows no drag it comes down 0.3 m off."""
+    lost = lose_link_and_poses((REPOSITORY / "flights" / "line.yaml", told_of_drag, 5, 6))
+    assert lost["most"] < 0.08
+    assert lost["outside"] == 0

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import Timeouts
+from cfplan.flight.firmware import Timeouts, estimate_errors
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES
 from cfplan.vehicle.airframe import GRAVITY
@@ -80,8 +80,8 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
 
 def _astray(limits: Limits, time: NDArray) -> tuple[NDArray, float]:
     """Return how far, m, it is off its way after a blind second and a fall of `time`, s: aside, and upwards."""
-    wrong, blind = limits.link_loss, Timeouts().watchdog_at_latest
-    push = GRAVITY * math.tan(wrong.attitude_error)
-    aside = wrong.velocity_error * blind + 0.5 * push * blind**2
-    speed = wrong.velocity_error + push * blind
-    return aside + speed * time, 0.5 * wrong.vertical_acceleration_error * blind**2
+    (attitude_error, velocity_error), blind = estimate_errors(limits), Timeouts().watchdog_at_latest
+    push = GRAVITY * math.tan(attitude_error)
+    aside = velocity_error * blind + 0.5 * push * blind**2
+    speed = velocity_error + push * blind
+    return aside + speed * time, 0.5 * limits.link_loss.vertical_acceleration_error * blind**2

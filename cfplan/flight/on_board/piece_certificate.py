@@ -173,7 +173,9 @@ def measures_along(samples: Samples, airframe: Airframe) -> NDArray:
     inertia = np.array(airframe.inertia)
     torque = inertia * turning + np.cross(rate, inertia * rate)
     motors = motor_thrusts(airframe, airframe.mass * thrust, (torque[:, 0], torque[:, 1], torque[:, 2]))
-    return measures_of(velocity, acceleration, rate, z, thrust, turning, np.stack(motors, axis=1))
+    return measures_of(
+        velocity, acceleration, rate, z, thrust, angular_acceleration=turning, motor_thrust=np.stack(motors, axis=1)
+    )
 
 
 def _dot(first: NDArray, second: NDArray) -> NDArray:

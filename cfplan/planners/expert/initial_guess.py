@@ -24,6 +24,7 @@ def guess(
     airframe: Airframe,
     limits: PlanLimits,
     nodes: int,
+    *,
     unit: float,
     start: BoundaryState | None,
     end: BoundaryState | None,

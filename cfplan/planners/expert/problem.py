@@ -191,8 +191,8 @@ def build_problem(
     lower, upper = _limits_at_points(layout, ends, margin)
     if coefficients is None:
         coefficients = guess(
-            path, segment.airframe, limits, nodes, unit, ends.start, ends.end,
-            yaw_angle + FREE_START / 2 if layout.shape.free_yaw else None,
+            path, segment.airframe, limits, nodes, unit=unit, start=ends.start, end=ends.end,
+            yaw=yaw_angle + FREE_START / 2 if layout.shape.free_yaw else None,
         )  # fmt: skip
     return Problem(
         layout, ends, (nominal[0] < REST, nominal[nodes] < REST), unit, step, _point_data(segment, step),

@@ -206,13 +206,14 @@ def merit_terms(g, bounds, slacks, step, share, barrier, rows):
 
 
 def accept_step(
-    g: NDArray, bounds: NDArray, slacks: NDArray, step: NDArray, share: float, share_dual: float, barrier: float
+    g: NDArray, bounds: NDArray, slacks: NDArray, direction: SearchDirection, share: float, barrier: float
 ) -> tuple[NDArray, NDArray, Errors]:
-    """Return (slacks, terms, Errors) after these shares of the step, which led to g.
+    """Return (slacks, terms, Errors) after a share of the slacks' step, which led to g.
 
-    Multipliers stay within a factor of what the barrier makes of their slacks.
+    Multipliers go as far as they may, and stay within a factor of what the barrier makes of their slacks.
     """
     after, terms = np.empty_like(slacks), np.empty((4, len(g)))
+    step, share_dual = direction.step, direction.share_dual
     return after, terms, Errors(*_accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms))
 
 

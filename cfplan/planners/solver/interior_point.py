@@ -135,6 +135,17 @@ class _Filter:
         return "widens" if better else ""
 
 
+class _Here(NamedTuple):
+    """Where a line search begins, and its direction."""
+
+    v: NDArray
+    dv: NDArray
+    slacks: NDArray
+    infeasible: float
+    merit: float
+    slope: float  # of the merit along dv
+
+
 class _Step(NamedTuple):
     v: NDArray
     values: Values
@@ -155,10 +166,7 @@ def minimise(
     """
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
-    if known is None:
-        slacks, terms = initialise(values.constraints, bounds, search.multipliers * barrier, search.push)
-    else:
-        slacks, terms = carried_over(values.constraints, known.bounds, known.slacks, bounds)
+    slacks, terms = _begun(values.constraints, bounds, search, known)
 
     def ended(solved: bool, iterations: int, message: str) -> SearchResult:
         return SearchResult(v, values, Multipliers(bounds, slacks), solved, iterations, message)
@@ -173,14 +181,13 @@ def minimise(
             return ended(False, iteration, f"{OUT_OF_TIME} after {iteration} iterations")
         if not math.isfinite(infeasible + off_gradient + values.cost):
             return ended(False, iteration, "a value is not a number")
-        lowered = False
+        before = barrier
         while _error(off, off_gradient, search) <= BARRIER_SOLVED * barrier:
             if barrier <= search.last_barrier:
                 return ended(True, iteration, f"solved in {iteration} iterations")
             barrier = max(search.last_barrier, min(BARRIER_FACTOR * barrier, barrier**BARRIER_POWER))
             off = errors(values.constraints, bounds, slacks, barrier)
-            lowered = True
-        if lowered:
+        if barrier < before:
             filtered.pairs.clear()
             infeasible, walls = merit_terms(values.constraints, bounds, slacks, slacks, 0.0, barrier, rows)
 
@@ -191,23 +198,28 @@ def minimise(
         dg = near.jvp(dv)
         direction = search_direction(values.constraints, dg, bounds, slacks, barrier, max(BOUNDARY, 1 - barrier))
         del near, dg  # so that the next ones get their memory, which the processor's cache still holds
-        before = infeasible, values.cost + walls
-        step = _line_search(program, v, dv, slacks, direction, barrier, before, slope + direction.slope, filtered)
+        here = _Here(v, dv, slacks, infeasible, values.cost + walls, slope + direction.slope)
+        step = _line_search(program, here, direction, barrier, filtered)
         if step is None or step.share < search.least_step:
             return ended(False, iteration, "no step improves the solution")
         if step.widens:
-            filtered.pairs.append(((1 - FILTER) * infeasible, before[1] - FILTER * infeasible))
+            filtered.pairs.append(((1 - FILTER) * infeasible, here.merit - FILTER * infeasible))
         v, values, infeasible, walls = step.v, step.values, step.infeasible, step.walls
-        slacks, terms, off = accept_step(
-            values.constraints, bounds, slacks, direction.step, step.share, direction.share_dual, barrier
-        )
+        slacks, terms, off = accept_step(values.constraints, bounds, slacks, direction, step.share, barrier)
         whole = step.share == direction.share_dual == 1.0
-        del direction
+        del here, direction
         if search.predicted_gradient_factor is not None and whole and barrier <= search.last_barrier:
             left = search.predicted_gradient_factor * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
                 return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
     return ended(False, search.iterations, f"not solved in {search.iterations} iterations")
+
+
+def _begun(g: NDArray, bounds: NDArray, search: Search, known: Multipliers | None) -> tuple[NDArray, NDArray]:
+    """Return (slacks, terms) where a search begins."""
+    if known is None:
+        return initialise(g, bounds, search.multipliers * search.barrier, search.push)
+    return carried_over(g, known.bounds, known.slacks, bounds)
 
 
 @njit(error_model="numpy")
@@ -234,18 +246,19 @@ def _newton_step(matrix, gradients, barrier, regularised):
 
 
 def _line_search(
-    program: NonlinearProgram, v: NDArray, dv: NDArray, slacks: NDArray, direction: SearchDirection, barrier: float,
-    before: tuple[float, float], slope: float, filtered: _Filter,
-) -> _Step | None:  # fmt: skip
+    program: NonlinearProgram, here: _Here, direction: SearchDirection, barrier: float, filtered: _Filter
+) -> _Step | None:
     """Halve the step until the filter takes it; None where it never does."""
     share = direction.share
     for _ in range(HALVINGS):
-        there = v + share * dv
+        there = here.v + share * here.dv
         values = program.evaluate(there)
         infeasible, walls = merit_terms(
-            values.constraints, program.bounds, slacks, direction.step, share, barrier, program.rows
+            values.constraints, program.bounds, here.slacks, direction.step, share, barrier, program.rows
         )
-        if verdict := filtered.judge(before, (infeasible, values.cost + walls), share * slope):
+        if verdict := filtered.judge(
+            (here.infeasible, here.merit), (infeasible, values.cost + walls), share * here.slope
+        ):
             return _Step(there, values, share, infeasible, walls, verdict == "widens")
         share /= 2
     return None

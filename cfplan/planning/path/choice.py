@@ -127,9 +127,10 @@ def _check_kept(found: ChosenKnots, path_file: PathFile) -> None:
                 hint=more if cut else "add a waypoint before it or behind it, or turn its yaw_deg by 180",
             )
     if path_file.corridor is not None and not inside(found.aside):
+        leg = found.aside_leg + 1
         raise InfeasibleError(
-            f"no path was found that stays within {path_file.corridor:g} m of the straight lines: the best leaves them "
-            f"by {found.aside + path_file.corridor:.3f} m",
+            f"no path was found that stays within {path_file.corridor:g} m of the straight lines: the best is "
+            f"{found.aside + path_file.corridor:.3f} m off between waypoints {leg} and {leg + 1}",
             where=str(path_file.source),
             hint=more if cut else "widen the corridor, or give waypoints that turn less sharply",
         )

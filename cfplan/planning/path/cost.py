@@ -145,15 +145,17 @@ class PathCost:
     def missed(self, x: NDArray) -> float:
         """Return how far, m, the path leaves the room, between samples too; negative inside."""
         _, beyond = distances_beyond(self.variables.knots(x).path, self.room.space)
-        return max(float(beyond.max()), self.aside(x))
+        return max(float(beyond.max()), self.aside(x)[0])
 
-    def aside(self, x: NDArray) -> float:
-        """Return how far, m, it leaves the corridor, likewise."""
+    def aside(self, x: NDArray) -> tuple[float, int]:
+        """Return how far, m, it leaves the corridor, likewise, and the straight line where it does most."""
         if self.room.corridor is None:
-            return -math.inf
+            return -math.inf, 0
         knots = self.variables.knots(x)
         path = knots.path
         s = np.linspace(path.breaks[:-1], path.breaks[1:], _SAMPLES, axis=1)
         bend = np.linalg.norm(path(s, 2), axis=-1).max(axis=1) * (np.diff(path.breaks) / (_SAMPLES - 1)) ** 2 / 8
-        aside = self.room.aside(path(s.ravel()), self._leg(knots, s.ravel())).reshape(s.shape)
-        return float((aside + bend[:, None]).max())
+        leg = self._leg(knots, s.ravel())
+        aside = self.room.aside(path(s.ravel()), leg) + np.repeat(bend, _SAMPLES)
+        most = int(aside.argmax())
+        return float(aside[most]), int(leg[most])

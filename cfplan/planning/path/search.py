@@ -33,6 +33,7 @@ class ChosenKnots(NamedTuple):
     knots: Knots
     missed: float  # m, how far the path leaves the room; negative inside
     aside: float  # m, how far it leaves the corridor; likewise
+    aside_leg: int  # the straight line between waypoints where it does so most, counted from 0
     finished: bool  # before the deadline
 
 
@@ -99,7 +100,7 @@ def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadli
         x, _ = _descend_inside(cost, cost.by_length, x, LOOSE_TOLERANCE, deadline)
     x, finished = _descend_inside(cost, cost, x, TOLERANCE, deadline)
     x = x if cost.best is None else cost.best
-    return ChosenKnots(cost.variables.knots(x), cost.missed(x), cost.aside(x), finished)
+    return ChosenKnots(cost.variables.knots(x), cost.missed(x), *cost.aside(x), finished)
 
 
 def _descend_inside(

@@ -48,7 +48,7 @@ def read_numbers(
         last = max(data.rfind(b"\n", begin, end) + 1, begin)
         if last < end == len(data):  # the file ends within a line
             return read_numbers(data, begin, last, columns, width, where, delimiter=delimiter, point=point)[0], True
-        raise _mistake(data, begin, end, columns, width, where, delimiter, point) from None
+        raise _mistake(data, begin, end, columns, width, where, delimiter=delimiter, point=point) from None
     return {column: values.to_numpy() for column, values in zip(columns, table.columns, strict=True)}, False
 
 
@@ -63,7 +63,7 @@ def line_at(data: bytes, offset: int) -> int:
 
 
 def _mistake(
-    data: bytes, begin: int, end: int, columns: Sequence[int], width: int, where: str, delimiter: str, point: str
+    data: bytes, begin: int, end: int, columns: Sequence[int], width: int, where: str, *, delimiter: str, point: str
 ) -> InputError:
     """Return the error for the first line, and the cell in it, that cannot be read."""
     with_point = str.maketrans({point: ".", ".": point})

@@ -6,6 +6,7 @@ Mellinger's, flies on the estimate. Each millisecond: sensors, a pose if one arr
 second time), the body.
 """
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import NamedTuple
@@ -87,6 +88,8 @@ class _Loop(NamedTuple):
     kalman: Filter
     prior: NDArray
     lowpass: NDArray  # (2, 5) of gyroscope and accelerometer
+    level_at: int  # ms at which a vehicle without setpoints levels out
+    off_at: int  # ms at which its motors stop
 
 
 def fly_with_estimator(
@@ -101,22 +104,23 @@ def fly_with_estimator(
     mode: mellinger.Modes = mellinger.ON_BOARD,
     memory: NDArray | None = None,
     estimator: bool = True,
+    level_at: float = math.inf,
+    off_at: float = math.inf,
 ) -> EstimatedFlight:
     """Fly setpoints, (K, 14 or 20) as the controller of the gains takes them, from `start`, (13,).
 
     They come into force at `times`, (K,) s; the first holds before. `scale`, (N,), is the thrust scale at each
     millisecond of the flight; `mode` is that of Mellinger's setpoints, `memory` the controller's at the start.
-    Without the estimator the controller knows the true state.
+    Without the estimator the controller knows the true state. At `level_at` and `off_at`, s, the supervisor of a
+    vehicle that has lost its link levels it out, and stops its motors.
     """
-    by_lee = isinstance(gains, LeeGains)
-    steps = len(scale)
+    by_lee, steps = isinstance(gains, LeeGains), len(scale)
     states, beliefs = np.zeros((steps, STATE_SIZE)), np.zeros((steps, BELIEF_SIZE))
     states[0, :BELIEF_SIZE] = beliefs[0] = start
     states[0, MOTORS] = airframe.hover_thrust
     vehicle = new_vehicle(states[0], pack_airframe(airframe, floor=-np.inf))
     if memory is not None:
         vehicle[MEMORY : MEMORY + len(memory)] = memory
-    most = airframe.motor_thrust_max
     per_unit = 0.25 / gains.mass_thrust if isinstance(gains, MellingerGains) else 0.0
     prior = Prior(drag_x=poses.drag[0], drag_y=poses.drag[1], drag_z=poses.drag[2]).pack()
     attitude_latency = poses.latency if poses.attitude_latency is None else poses.attitude_latency
@@ -129,12 +133,12 @@ def fly_with_estimator(
         beliefs=beliefs,
         control=np.zeros((steps, 4)),
         asked=np.zeros((steps, 4)),
-        setpoints=np.ascontiguousarray(setpoints, dtype=float),
+        setpoints=np.array(setpoints, dtype=float),  # a copy: levelling out changes the last one
         changes=np.round(times / TIME_STEP).astype(np.int64),
         mode=mode,
         gains=gains.pack(),
         vehicle=vehicle,
-        levers=np.array([airframe.arm, airframe.thrust_to_torque, most, per_unit, 0.0 if by_lee else 1.0]),
+        levers=np.array([airframe.arm, airframe.thrust_to_torque, airframe.motor_thrust_max, per_unit, not by_lee]),
         scale=np.asarray(scale, dtype=float),
         arrivals=np.round(poses.time / TIME_STEP).astype(np.int64),
         noise=np.ascontiguousarray(poses.noise, dtype=float),
@@ -142,6 +146,8 @@ def fly_with_estimator(
         kalman=_settled(start, pose, prior),
         prior=prior,
         lowpass=np.stack([_lowpass(GYRO_CUTOFF), _lowpass(ACCELEROMETER_CUTOFF)]),
+        level_at=round(min(level_at / TIME_STEP, steps)),
+        off_at=round(min(off_at / TIME_STEP, steps)),
     )
     _run(loop, estimator)
     return EstimatedFlight(states, beliefs, loop.control, loop.asked)
@@ -212,15 +218,20 @@ def _run(loop: _Loop, estimator: bool) -> None:
         loop.beliefs[step] = belief
         while newest + 1 < len(loop.changes) and loop.changes[newest + 1] <= step:
             newest += 1
-        if step % 2 == 0:
-            _control(loop, loop.setpoints[newest], belief, control)
+        if step == loop.level_at:
+            loop.setpoints[newest, mellinger.YAW_RATE] = 0.0
+        if step >= loop.off_at:
+            vehicle[ASKED : ASKED + 4] = 0.0
+        elif step % 2 == 0:
+            mode = mellinger.LEVEL_OUT if step >= loop.level_at else loop.mode
+            _control(loop, mode, loop.setpoints[newest], belief, control)
         loop.control[step], loop.asked[step] = control, vehicle[ASKED : ASKED + 4]
         vehicle[THRUST_SCALE] = loop.scale[step]
         step_and_feel(vehicle, TIME_STEP, forces)
 
 
 @register_jitable
-def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) -> None:
+def _control(loop: _Loop, mode: mellinger.Modes, setpoint: NDArray, belief: NDArray, control: NDArray) -> None:
     """Run the controller: write thrust and torques, and command the motors."""
     arm, twist, most, per_unit, by_mellinger = loop.levers
     asked = loop.vehicle[ASKED : ASKED + 4]
@@ -229,7 +240,7 @@ def _control(loop: _Loop, setpoint: NDArray, belief: NDArray, control: NDArray) 
         lee.divide_power(control, (arm, twist), most, asked)
         return
     loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE] = setpoint
-    units = mellinger.step_mellinger(loop.vehicle, loop.gains, loop.mode, belief, 2 * TIME_STEP)
+    units = mellinger.step_mellinger(loop.vehicle, loop.gains, mode, belief, 2 * TIME_STEP)
     control[0], control[1] = 4 * per_unit * units[0], 2 * arm * per_unit * units[1]
     control[2], control[3] = -2 * arm * per_unit * units[2], -4 * twist * per_unit * units[3]  # legacy signs
     commands = mellinger.mixed(units)

@@ -53,6 +53,7 @@ LEVEL_OUT = (DISABLE, DISABLE, ABSOLUTE, ABSOLUTE, ABSOLUTE, VELOCITY_MODE, ABSO
 ON_BOARD = (ABSOLUTE, ABSOLUTE, ABSOLUTE, DISABLE, DISABLE, ABSOLUTE, DISABLE)
 NOTHING = (DISABLE,) * 7  # of the null setpoint: motors off
 
+YAW_RATE = 15  # rad/s, its place in a setpoint
 FULL_COMMAND = 65535  # of one motor
 _MOMENT_LIMIT = 32000.0
 
@@ -152,7 +153,7 @@ def _wanted_yaw(
         # Level out: the firmware keeps height and the direction that it points in.
         return _direction(turn[0][0], turn[0][1])
     if mode[MODE_YAW] == VELOCITY_MODE:
-        ahead = np.arctan2(turn[0][1], turn[0][0]) + batch[(SETPOINT + 15) * width + n] * period
+        ahead = np.arctan2(turn[0][1], turn[0][0]) + batch[(SETPOINT + YAW_RATE) * width + n] * period
         return np.cos(ahead), np.sin(ahead)
     if mode[MODE_YAW] == ABSOLUTE:
         return np.cos(batch[(SETPOINT + 18) * width + n]), np.sin(batch[(SETPOINT + 18) * width + n])

@@ -39,7 +39,16 @@ from cfplan.simulation.engine.layout import (
     vector,
     write_vector,
 )
-from cfplan.simulation.engine.mellinger import FULL_STATE, LEVEL_OUT, ON_BOARD, Gains, ask, mellinger, mixed
+from cfplan.simulation.engine.mellinger import (
+    FULL_STATE,
+    LEVEL_OUT,
+    ON_BOARD,
+    YAW_RATE,
+    Gains,
+    ask,
+    mellinger,
+    mixed,
+)
 
 NEVER = 2**40  # ms
 PART = 150  # ms of motion per box, if there are several
@@ -223,7 +232,7 @@ def _supervise(values: NDArray, schedule: Schedule, now: int) -> None:
     """Level out, or stop the motors."""
     if now == schedule.level_after:
         for n in range(WIDTH):
-            values[(SETPOINT + 15) * WIDTH + n] = 0.0
+            values[(SETPOINT + YAW_RATE) * WIDTH + n] = 0.0
     if now == schedule.off_after:
         for row in range(ASKED, ASKED + 4):
             for n in range(WIDTH):

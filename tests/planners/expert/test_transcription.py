@@ -205,7 +205,7 @@ def test_a_guess_between_two_states_has_both_to_the_last_bit_and_does_not_jerk()
     part, nodes = PATH.part(profile.s[first], profile.s[last]), last - first
     start, end = profile.boundary(first), profile.boundary(last)
     unit = limits.speed**2
-    cubic = guess(part, SIMULATION.airframe, limits, nodes, unit, start, end, None)[:, 0] * unit
+    cubic = guess(part, SIMULATION.airframe, limits, nodes, unit=unit, start=start, end=end, yaw=None)[:, 0] * unit
     segment = Segment(part, SIMULATION.airframe, limits, Ends(start, end), YawSpline.fixed(part, nodes, 0.0),
                       layout_of(Shape(nodes, False)))  # fmt: skip
     found = segment.profile(cubic[:, None] / unit)
