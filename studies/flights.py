@@ -150,7 +150,7 @@ def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = f
     lab = Conditions(settings.loss, settings.pose_noise, settings.vicon, settings.seed)
     for file in settings.path_files:
         load_path_file(file)
-    cases = {}
+    cases: dict[str, tuple[int, int, Prepared]] = {}
     for number, file in enumerate(settings.path_files):
         run.progress(number, len(settings.path_files))
         prepared = _prepared(file, settings.seed)
@@ -254,5 +254,9 @@ def _judged(row: JudgedFlight, trajectory: Trajectory, flight: RealTimeFlight) -
 
 
 STUDY = Study(
-    Settings, work, tables, "flights/*.yaml --repeats 5 --loss 0.05 --vicon --drawn -o results/flights.json", one_at_a_time=True
+    Settings,
+    work,
+    tables,
+    "flights/*.yaml --repeats 5 --loss 0.05 --vicon --drawn -o results/flights.json",
+    one_at_a_time=True,
 )

@@ -1,12 +1,12 @@
-"""In the stepped lab the hover after take-off shows vehicles that are not as stated, by streamed and on-board flight."""
+"""In the stepped lab the hover after take-off shows vehicles that are not as stated, streamed and on board."""
 
 from dataclasses import replace
 
 import pytest
+from stepped_flight import fly_stepped
 
 from cfplan.flight.telemetry import Phase
 from cfplan.simulation.lab.stepped_lab import SteppedLab
-from stepped_flight import fly_stepped
 
 pytestmark = pytest.mark.integration
 
