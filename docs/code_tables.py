@@ -15,7 +15,7 @@ from cfplan.flight.firmware import TIMEOUTS, Timeouts, version_text
 from cfplan.flight.mocap.child import FRAME_ALARM
 from cfplan.flight.mocap.datastream_client import FRAME_TIMEOUT
 from cfplan.flight.mocap.feed import RESTART_BACKOFF
-from cfplan.flight.mocap.pose_predictor import FARTHEST
+from cfplan.flight.mocap.pose_tracker import MAX_EXTRAPOLATION
 from cfplan.flight.mocap.source import OPEN_WITHIN
 from cfplan.flight.pilot.abort_monitor import LATEST_SETPOINT
 from cfplan.flight.pilot.abort_reasons import AbortReason
@@ -114,7 +114,7 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
     ),
     "poses": (
         TimeOut("a pose, before take-off", POSE.age_warning, "preflight refuses", "the pilot", "pose.age_warning"),
-        TimeOut("a pose, in the air", FARTHEST,
+        TimeOut("a pose, in the air", MAX_EXTRAPOLATION,
                 "until then it is predicted from what the vehicle's sensors measured since", "the pilot"),
         TimeOut("poses", POSE.age_brake,
                 "the vehicle brakes along its path; a pose of that age is no longer sent to it", "the pilot",

@@ -1,6 +1,6 @@
 """Fly along PATH at full speed with one fault per flight, and judge the pilot's reaction by the simulated truth.
 
-In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose gate, the virtual Crazyflie
+In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose tracker, the virtual Crazyflie
 and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
 """
 

@@ -92,7 +92,6 @@ class Settings:
     repeats: int = option(1, "Flights of each path.", least=1)
     loss: float = option(0.0, "Fraction of the radio's packets that is lost.", least=0)
     pose_noise: float = option(0.001, "Standard deviation of poses on each axis, m.", least=0)
-    vicon: bool = option(False, "Poses by Vicon's protocol, as with --mocap vicon://lab/cf1.")
     drawn: bool = option(False, "Each flight on another vehicle, drawn by the spread of the airframe.")
     seed: int = option(0, "Seed of the noise of each path's first flight.", least=0)
 
@@ -147,7 +146,7 @@ def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = f
 
     Raises InputError, before anything is planned, if a file is not a path file or a condition is out of range.
     """
-    lab = Conditions(settings.loss, settings.pose_noise, settings.vicon, settings.seed)
+    lab = Conditions(settings.loss, settings.pose_noise, settings.seed)
     for file in settings.path_files:
         load_path_file(file)
     cases: dict[str, tuple[int, int, Prepared]] = {}
@@ -179,7 +178,7 @@ def tables(settings: Settings, rows: list[JudgedFlight]) -> Iterator[Table]:
     lag = planned[-1].motor_lag if planned else math.nan
     title = (
         f"Flights: deviation from the reference in time, {100 * settings.loss:g} % of radio packets lost, "
-        f"{1e3 * settings.pose_noise:g} mm of pose noise{' by Vicon' if settings.vicon else ''}, motor lag {lag:g} s"
+        f"{1e3 * settings.pose_noise:g} mm of pose noise, motor lag {lag:g} s"
         f"{', each on a vehicle drawn by the spread of the airframe' if settings.drawn else ''}"
     )
     yield table("plans", "Plans", PLAN_COLUMNS, planned, by=("path",))
@@ -257,6 +256,6 @@ STUDY = Study(
     Settings,
     work,
     tables,
-    "flights/*.yaml --repeats 5 --loss 0.05 --vicon --drawn -o results/flights.json",
+    "flights/*.yaml --repeats 5 --loss 0.05 --drawn -o results/flights.json",
     one_at_a_time=True,
 )

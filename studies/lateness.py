@@ -136,7 +136,7 @@ def work(
             return [WakeUps("stream", priority, "not permitted here")] if streaming else []
         with sleeper(RATE, first=priority == FIRST) as asleep:
             if streaming:
-                return _streaming(priority, asleep, partial(fly, patiently, Conditions(vicon=True)))
+                return _streaming(priority, asleep, partial(fly, patiently, Conditions()))
             stolen = _stolen()
             time.sleep(settings.seconds)
             late = asleep.late()

@@ -21,7 +21,7 @@ from cfplan.recording.writer import RecordWriter, wall_time_at_zero
 from cfplan.safety.limits import Limits
 from cfplan.simulation.lab.lab import Lab, Truth, start_lab
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings
+from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
@@ -34,11 +34,10 @@ _MOST_NOISE = 1.0  # m
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """Conditions of the lab: radio loss, pose noise, motion capture."""
+    """Conditions of the lab: radio loss, pose noise."""
 
     loss: float = 0.0  # fraction of the radio's transmissions
     pose_noise: float = 0.001  # m, standard deviation of each axis
-    vicon: bool = False  # poses through Vicon's protocol and client; else directly from the room
     seed: int = 0  # of all noise
     airframe: Airframe | None = None  # of the vehicle; None: as the mission's limits state it
 
@@ -78,11 +77,10 @@ View = Callable[[RecordHeader], AbstractContextManager[LiveView]]
 def simulated_lab(mission: Mission, conditions: Conditions) -> Lab:
     """Start a lab with these conditions."""
     noise, seed = conditions.pose_noise, conditions.seed
-    cameras = ViconSettings(position_noise=noise, seed=seed) if conditions.vicon else None
     lab = start_lab(
         conditions.airframe or mission.limits.airframe,
         vehicle=VehicleSettings(seed=seed),
-        room=RoomSettings(position_noise=noise, seed=seed, vicon=cameras),
+        room=RoomSettings(ViconSettings(position_noise=noise, seed=seed)),
     )
     if conditions.loss:
         lab.disturb(RadioFault(RadioFaultKind.LOSS, size=conditions.loss))
@@ -156,7 +154,7 @@ def _fly_once(
             RecordWriter(Path(folder), header) as writer,
             view(header) if view is not None else nullcontext() as watching,
         ):
-            poses = pose_source(lab.mocap_uri, mission.limits.pose) if conditions.vicon else RoomPoseSource(lab.number)
+            poses = pose_source(lab.mocap_uri, mission.limits.pose, open_within=10.0)
             flight.outcome = pilot(uri=lab.uri, drivers=[SimDriver], pose_source=poses, on_telemetry=hear)
             flight.truth = lab.truth()
         flight.reason = flight.outcome.reason

@@ -49,8 +49,8 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @click.option(
     "--mocap",
     "mocap_uri",
-    help="The vehicle in motion capture, e.g. vicon://192.168.1.2/cf1. sim:// has poses already; "
-    "vicon://lab/cf1 sends them through a virtual Vicon.",
+    help="The vehicle in motion capture, e.g. vicon://192.168.1.2/cf1. sim:// has a virtual Vicon, "
+    "vicon://lab/cf1; vicon-sdk://lab/cf1 reads it with Vicon's SDK.",
 )
 @click.option(
     "--records",

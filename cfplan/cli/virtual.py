@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cfplan.simulation.lab.lab import Lab, Truth
 
 _LOOK = 0.05  # s
-_MOST = 5  # vehicles: cfclient scans ten ports, and each has two
+_MOST = 5  # vehicles, which also stand apart in a small space
 _APART = 1.0  # m between vehicles that stand side by side
 _LAST_PORT = 65535
 FLOW_DECK = "deck.bcFlow2"  # firmware parameter, 1 if the deck was detected at start
@@ -49,8 +49,8 @@ Examples:
   CFLIB_URI=udp://127.0.0.1:19850 python examples/logging/basiclog.py""",
 )
 @click.option(
-    "--port", type=click.IntRange(1024, 65534), default=19850, show_default=True,
-    help="UDP port; cfclient scans 19850 to 19859. The next port sends poses; each further vehicle takes two more.",
+    "--port", type=click.IntRange(1024, 65535), default=19850, show_default=True,
+    help="UDP port; cfclient scans 19850 to 19859. Each further vehicle takes the next one.",
 )  # fmt: skip
 @click.option(
     "--count", type=click.IntRange(1, _MOST), default=1, show_default=True,
@@ -134,7 +134,7 @@ class VirtualRoom:
                 where="--flow-deck",
                 hint="leave it out, or leave --vicon out",
             )
-        last = self.port + 2 * self.count - 1
+        last = self.port + self.count - 1
         if last > _LAST_PORT:
             raise InputError(f"{self.count} vehicles need ports to {last}", where="--port", hint="choose a lower one")
 
@@ -145,7 +145,7 @@ class VirtualRoom:
         from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
         from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
-        vicon = ViconSettings(subject=self.names[0], port=self.vicon_port) if self.vicon_port else None
+        vicon = ViconSettings(subject=self.names[0], port=self.vicon_port or 0)
         stored = {FLOW_DECK: 1.0} if self.flow_deck else {}
         vehicles = [
             VehicleSettings(position=place, seed=k, stored=stored) for k, place in enumerate(self.places(), start=1)
@@ -154,7 +154,7 @@ class VirtualRoom:
             self.limits.airframe,
             vehicle=vehicles[0],
             companions=dict(zip(self.names[1:], vehicles[1:], strict=True)),
-            room=RoomSettings(on_board=vicon is None, vicon=vicon),
+            room=RoomSettings(vicon, on_board=self.vicon_port is None),
             port=self.port,
         )
 

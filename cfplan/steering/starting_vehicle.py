@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 SIMULATED = "sim://"
 VIRTUAL_SUBJECT = "cf1"  # the only body that it sees
 VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
+_OPENS_WITHIN = 10.0  # s for its first poses: it is there, but this computer may be busy
 
 
 def check_uris(uri: str, mocap_uri: str | None) -> None:
@@ -92,34 +93,25 @@ class StartingVehicle:
         self.pilot: PilotProcess = self._open.enter_context(start_pilot(self.drivers))
 
     def _launch_lab(self) -> "StartingLab":
-        from cfplan.flight.mocap.uri import parse_uri
         from cfplan.simulation.lab.lab import launch_lab
-        from cfplan.simulation.lab.room import RoomSettings
-        from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 
-        room, number = RoomSettings(), int(self.uri.removeprefix(SIMULATED))
-        if self._mocap_uri is not None and _is_virtual(self.uri, self._mocap_uri):
-            subject = parse_uri(self._mocap_uri, subject_needed=True).subject
-            room = RoomSettings(vicon=ViconSettings(subject=subject))
-        return launch_lab(self._limits.airframe, room=room, number=number)
+        return launch_lab(self._limits.airframe, number=int(self.uri.removeprefix(SIMULATED)))
 
     def poses(self, on_step: "OnStep") -> "PoseSource":
         """Wait for the lab where there is one; return the source of the vehicle's poses."""
         from cfplan.flight.mocap.source import pose_source
         from cfplan.flight.mocap.uri import parse_uri
 
-        mocap = parse_uri(self._mocap_uri, subject_needed=True) if self._mocap_uri is not None else None
+        mocap = parse_uri(self._mocap_uri or f"vicon://{VIRTUAL_VICON}/{VIRTUAL_SUBJECT}", subject_needed=True)
         if self._lab is not None:
             from cfplan.preparation.steps import step
-            from cfplan.simulation.lab.room import RoomPoseSource
 
             with step(on_step, "lab") as results:
                 lab = self._lab.wait()
                 results.append(f"the virtual Crazyflie is at {lab.uri}")
-            if mocap is None:
-                return RoomPoseSource(lab.number)
             if mocap.host == VIRTUAL_VICON:
-                return pose_source(lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1), self._limits.pose)
+                uri = lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1)
+                return pose_source(uri, self._limits.pose, open_within=_OPENS_WITHIN)
         return pose_source(str(mocap), self._limits.pose)
 
     def __enter__(self) -> "StartingVehicle":

@@ -31,8 +31,7 @@ from cfplan.flight.clock import SteppedClock
 from cfplan.flight.mocap import child, datastream
 from cfplan.flight.mocap.datastream_client import DataStreamClient
 from cfplan.flight.mocap.frames import Frame, Scene
-from cfplan.flight.mocap.pose_gate import PoseGate
-from cfplan.flight.mocap.pose_predictor import PosePredictor
+from cfplan.flight.mocap.pose_tracker import PoseTracker
 from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.survey import Surveyor
 from cfplan.flight.mocap.uri import parse_uri
@@ -221,14 +220,13 @@ def _use_datastream(folder: Path) -> None:
             surveyor.add(message)
     for body in surveyor.report().bodies:
         str(body.remark)
-    gate, predictor = PoseGate(0.1), PosePredictor()
     uri, limits = parse_uri("vicon://lab/cf1", subject_needed=True), load_limits(SAFETY).pose
     source = MocapSource(uri, limits, clock=SteppedClock(), make_feed=lambda _: _Feed(messages))
     source.open()
+    tracker = PoseTracker(limits)
     for pose in source.poses():
-        if not gate.fault(pose):
-            predictor.add(pose)
-            predictor.position(pose.time + 0.01)
+        tracker.take(pose)
+        tracker.to_send(pose.time + 0.01)
 
 
 def _heard(content: bytes) -> list[Any]:

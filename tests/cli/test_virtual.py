@@ -53,8 +53,8 @@ def test_vehicles_stand_apart_inside_the_space(count, wide):
 
 
 def test_vehicles_for_which_there_are_no_ports_are_refused():
-    with pytest.raises(InputError, match="need ports to 65537"):
-        VirtualRoom(load_limits(SAFETY), 65528, 5, None).require_ports()
+    with pytest.raises(InputError, match="need ports to 65536"):
+        VirtualRoom(load_limits(SAFETY), 65532, 5, None).require_ports()
 
 
 def test_a_flow_deck_is_a_parameter_that_says_so():

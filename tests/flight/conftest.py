@@ -112,7 +112,7 @@ class World:
     uplink_dead: bool = False
     revived: list[str] = field(default_factory=list)  # logs that the pilot created anew
     restarts: bool = True
-    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    push: float | None = None  # m/s along y, whatever its setpoints are
     messages: list[Telemetry] = field(default_factory=list)
     forwarded: list[tuple[float, ...]] = field(default_factory=list)
     calls: list[str] = field(default_factory=list)
@@ -126,7 +126,7 @@ class World:
 
     def __post_init__(self) -> None:
         self.clock = SteppedClock(100.0, self.pass_time)
-        self.motors_on, self._blown = False, (0.0, 0.0, 0.0)
+        self.motors_on = False
         self._poses: list[Pose] = []
         self._asked = (0.0, 0.0, 0.0)  # m/s, by the last setpoint
         self._count = 0
@@ -179,9 +179,10 @@ class World:
             self.motors_off_since = self.now
         if flying and not self.motors_on:
             self.motors_off_in_the_air += step
-        self._blown = tuple(a + b * step for a, b in zip(self._blown, self.push, strict=True))
-        self.position = tuple(a + b * step for a, b in zip(self.position, self.push, strict=True))
-        self.velocity = tuple(a + b for a, b in zip(self._asked, self.push, strict=True))
+        self.velocity = self._asked
+        if self.push is not None:
+            (x, y, z), (vx, _, vz) = self.position, self._asked
+            self.position, self.velocity = (x, y + self.push * step, z), (vx, self.push, vz)
         self._count += 1
         if self._count % 2 == 0:
             self._sense()
@@ -214,9 +215,6 @@ class World:
     def open(self) -> None:
         self._poses.clear()
 
-    def tell_attitude(self, attitude) -> None:
-        pass
-
     def poses(self) -> list[Pose]:
         came, self._poses = self._poses, []
         return came
@@ -229,7 +227,7 @@ class World:
         self.motors_on = True
         state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
         (x, y, z), self._asked = state.position[0].tolist(), tuple(state.velocity[0].tolist())
-        self.position = x + self._blown[0], y + self._blown[1], max(z + self._blown[2], self.floor)
+        self.position = x, y if self.push is None else self.position[1], max(z, self.floor)
 
     def send_pose(self, position, quaternion) -> None:
         self.forwarded.append((self.now, *position))

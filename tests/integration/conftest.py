@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from septic_flight import septic_payloads
 from stepped_flight import Flight
+from waiting import PATIENCE
 
+from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.packets import decode
@@ -17,7 +19,6 @@ from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import GroundManoeuvres, Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.lab import Lab, start_lab
-from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 
 SAFETY_FILE = Path(__file__).parents[2] / "safety.yaml"
@@ -59,7 +60,7 @@ def fly_in(patient_mission):
             telemetry.append(message)
             react(message)
 
-        source = RoomPoseSource(lab.number)
+        source = pose_source(lab.mocap_uri, patient_mission.limits.pose, open_within=PATIENCE)
         outcome = fly(patient_mission, uri=lab.uri, drivers=[SimDriver], pose_source=source, on_telemetry=note)
         return Flight(outcome, telemetry, lab.truth())
 

@@ -12,12 +12,12 @@ import pytest
 from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, LinkError
+from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, Phase, PoseReceived, SetpointSent, VehicleStatus
-from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -176,6 +176,7 @@ def test_an_empty_battery_stays_on_the_ground(mission, limits):
 
 def test_a_lab_that_is_gone_is_an_error_with_a_hint(mission, monkeypatch):
     monkeypatch.setenv("CFPLAN_SIM_7", "127.0.0.1:9")
+    source = pose_source("vicon://127.0.0.1:9/cf1", mission.limits.pose)
     with pytest.raises(LinkError) as caught:
-        fly(mission, uri="sim://7", drivers=[SimDriver], pose_source=RoomPoseSource(7))
+        fly(mission, uri="sim://7", drivers=[SimDriver], pose_source=source)
     assert caught.value.hint

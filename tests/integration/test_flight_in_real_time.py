@@ -94,9 +94,9 @@ def test_ctrl_c_at_full_speed_lands_and_twice_cuts_the_motors(limits, fly_in, ti
 
 _MAIN = """
 import multiprocessing, pickle, sys
+from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.process import fly
 from cfplan.flight.telemetry import SetpointSent
-from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 
 def show(message):
@@ -105,7 +105,8 @@ def show(message):
 
 if __name__ == "__main__":
     mission = pickle.load(open(sys.argv[1], "rb"))
-    fly(mission, uri="sim://2", drivers=[SimDriver], pose_source=RoomPoseSource(2), on_telemetry=show)
+    source = pose_source(sys.argv[2], mission.limits.pose, open_within=30.0)
+    fly(mission, uri="sim://2", drivers=[SimDriver], pose_source=source, on_telemetry=show)
 """
 
 
@@ -132,7 +133,7 @@ def test_whichever_process_is_killed_the_vehicle_comes_down(limits, patient_miss
     command = [sys.executable, str(tmp_path / "main.py"), str(tmp_path / "mission")]
     with (
         start_lab(limits.airframe, number=2) as lab,
-        subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as main,
+        subprocess.Popen([*command, lab.mocap_uri], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as main,
     ):
         assert main.stdout is not None
         pilot = int(main.stdout.readline())

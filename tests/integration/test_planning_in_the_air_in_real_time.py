@@ -6,17 +6,18 @@ import signal
 import numpy as np
 import pytest
 from stepped_flight import Flight
+from waiting import PATIENCE
 
 from cfplan.air.process import AirPlanner
 from cfplan.air.requests import PathAnswer, Wish
 from cfplan.air.timeline import hold
 from cfplan.errors import ExitCode
+from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.process import fly, start_pilot
 from cfplan.flight.telemetry import SetpointSent, Telemetry
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
-from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.simulation.lab.sim_driver import SimDriver
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
@@ -44,7 +45,8 @@ def fly_with_planner(lab, patient_mission):
                 answers.extend(planner.answers())
                 react(message, planner)
 
-            outcome = fly(mission, uri=lab.uri, pose_source=RoomPoseSource(lab.number), pilot=pilot, on_telemetry=note)
+            source = pose_source(lab.mocap_uri, mission.limits.pose, open_within=PATIENCE)
+            outcome = fly(mission, uri=lab.uri, pose_source=source, pilot=pilot, on_telemetry=note)
             answers += planner.answers(1.0) if planner.alive else []
         return Flight(outcome, telemetry, lab.truth()), answers
 

@@ -36,7 +36,7 @@ def outcome(code=ExitCode.OK, failed=(), deviation=OFF):
 class Lab:
     """The part of a lab that the study uses."""
 
-    uri, number = "sim://0", 0
+    uri, mocap_uri = "sim://0", "vicon://127.0.0.1:9/cf1"
 
     def __init__(self, truth):
         self._truth = truth

@@ -1,12 +1,11 @@
-"""Poses from motion capture: sources, the Vicon DataStream, and the gates that poses pass."""
+"""Poses from motion capture: sources, the Vicon DataStream, and the tracker that judges poses."""
 
 __all__ = [
     "datastream",
     "dead_reckoning",
     "frames",
-    "pose_gate",
-    "pose_predictor",
-    "pose_steps",
+    "pose_check",
+    "pose_tracker",
     "poses",
     "source",
     "survey",

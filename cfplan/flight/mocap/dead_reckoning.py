@@ -1,4 +1,4 @@
-"""Dead reckoning: where the vehicle is now, by its last poses and what its own sensors have measured since.
+"""Dead reckoning: how the vehicle has moved and turned since a pose, by its own sensors.
 
 A pose that is older than a straight line can bridge says where the vehicle was, not where it is. Sent as it is, it
 pulls the vehicle's filter back by the way flown since, and its velocity most of all: at 1.8 m/s, eight poses of 0.12 s
@@ -15,12 +15,11 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.mocap.pose_predictor import PosePredictor
 from cfplan.flight.telemetry import Estimate, Quaternion, Triple, VehicleStatus
 from cfplan.vehicle.rotations import product
 
 _REACH = 1.5  # s of the log that are kept, more than a pose that is sent may be old (`pose.age_brake` is at most 1 s)
-_LONGEST_GAP = 0.1  # s between two messages of the log, beyond which nobody knows what happened
+_LONGEST_GAP = 0.1  # s between two messages of the log, beyond which the motion between them is unknown
 
 _Samples = deque[tuple[float, Triple]]
 
@@ -39,25 +38,21 @@ class SensedMotion:
         if status is not None:
             _append(self._rates, status.time, status.body_rate)
 
-    def reckon(self, poses: PosePredictor, now: float) -> tuple[Triple, Triple] | None:
-        """Return position, m, and velocity, m/s, at `now`, s, from the last good poses on.
+    def displacement(self, velocity: Triple, at: float, since: float, now: float) -> Triple | None:
+        """Return the way, m, from `since` to `now`, s, of a vehicle that had `velocity`, m/s, `at` a time before, s.
 
-        None where the poses are too few to show a velocity, or the log does not say what happened since.
+        None where the log does not say what happened meanwhile.
         """
-        if math.isnan(poses.middle):
-            return None
-        known = _between(self._accelerations, poses.middle, now, poses.last.time)
+        known = _between(self._accelerations, at, now, since)
         if known is None:
             return None
         times, acceleration = known
         steps = np.diff(times)[:, None]
-        velocity = np.array(poses.velocity()) + np.vstack(
-            [np.zeros(3), np.cumsum(0.5 * steps * (acceleration[:-1] + acceleration[1:]), axis=0)]
-        )
-        ways = steps * velocity[:-1] + steps**2 * (2.0 * acceleration[:-1] + acceleration[1:]) / 6.0
-        x, y, z = (np.array(poses.last.position) + ways[times[:-1] >= poses.last.time].sum(axis=0)).tolist()
-        vx, vy, vz = velocity[-1].tolist()
-        return (x, y, z), (vx, vy, vz)
+        gained = np.cumsum(0.5 * steps * (acceleration[:-1] + acceleration[1:]), axis=0)
+        speeds = np.array(velocity) + np.vstack([np.zeros(3), gained])
+        ways = steps * speeds[:-1] + steps**2 * (2.0 * acceleration[:-1] + acceleration[1:]) / 6.0
+        x, y, z = ways[times[:-1] >= since].sum(axis=0).tolist()
+        return x, y, z
 
     def turn(self, quaternion: Quaternion, since: float, now: float) -> Quaternion | None:
         """Return the attitude at `now` of a vehicle that had another `since` then, s; None where the log is missing."""
@@ -67,8 +62,8 @@ class SensedMotion:
         times, rates = known
         for step, rate in zip(np.diff(times), 0.5 * (rates[:-1] + rates[1:]), strict=True):
             angle = float(np.linalg.norm(rate)) * step
-            share = math.sin(0.5 * angle) / angle * step if angle > 0.0 else 0.0
-            x, y, z = (share * rate).tolist()
+            scale = math.sin(0.5 * angle) / angle * step if angle > 0.0 else 0.0
+            x, y, z = (scale * rate).tolist()
             quaternion = product(quaternion, (x, y, z, math.cos(0.5 * angle)))
         return quaternion
 

@@ -9,14 +9,12 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene
-from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
+from cfplan.flight.mocap.pose_check import PoseCheck, Verdict
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, parse_uri
-from cfplan.flight.telemetry import Quaternion
 from cfplan.safety.limits import PoseLimits
 
 OPEN_WITHIN = 3.5  # s to see the first good poses
-_RATE_SLACK = 1.2  # times the expected rate may be forwarded; more only burdens the radio
 _FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
 _LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
 _READ_PERIOD = 0.005  # s between looks for them
@@ -31,8 +29,8 @@ def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_WITHI
 class MocapSource:
     """A PoseSource; goes to another process before it is opened.
 
-    Only good poses come out, dated back to when they were taken. A stream that is lost comes back by itself; until
-    then there is silence.
+    Poses are dated back to when they were taken. A stream that is lost comes back by itself; until then there is
+    silence.
     """
 
     def __init__(
@@ -51,20 +49,10 @@ class MocapSource:
         self._begin()
 
     def _begin(self) -> None:
-        self._classifier = PoseClassifier(self._limits.jump)
         self._frame_clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
-        self._next = -math.inf
-        self.fault = ""  # why no pose comes; "" while good poses come
-
-    def tell_attitude(self, attitude: Quaternion) -> None:
-        """Take the vehicle's own estimate of its attitude."""
-        self._classifier.attitude = attitude
-
-    @property
-    def counts(self) -> "Counter[Verdict]":
-        """Return how many poses had which verdict."""
-        return self._classifier.counts
+        self.hidden = 0  # frames without the body
+        self.fault = ""  # why no pose comes; "" while poses come
 
     @property
     def sees_delays(self) -> bool:
@@ -79,29 +67,27 @@ class MocapSource:
     def open(self) -> None:
         """Connect, and check that the body is seen upright and in metres. Raises a CfplanError within 5 s otherwise."""
         self._begin()
-        deadline = self._clock.now() + self._open_within
+        deadline, check = self._clock.now() + self._open_within, PoseCheck(self._limits.jump)
         self._feed = self._make_feed(self._uri)
         try:
             self._feed.start()
-            while len(self._first) < _ENOUGH:
-                self._first += self._read()
+            while check.counts[Verdict.GOOD] < _ENOUGH:
+                self._look(check)
                 self._check_subject()
                 failure = self._feed.failure()
                 if failure is not None:
-                    self._first += self._read()  # its last words say more
+                    self._look(check)  # its last words say more
                     raise failure
                 if self._clock.now() > deadline:
-                    raise self._nothing_came()
+                    raise self._nothing_came(check)
                 self._clock.sleep(_READ_PERIOD)
-            for pose in self._first:
-                _check_looks(pose, str(self._uri))
         except BaseException:
             self.close()
             raise
         self._feed.keep()
 
     def poses(self) -> list[Pose]:
-        """Return the good poses since the last call."""
+        """Return the poses since the last call."""
         if self._feed is None:
             return []
         found, self._first = self._first, []
@@ -126,27 +112,27 @@ class MocapSource:
                 error = message
             elif isinstance(message, Scene):
                 self._scene = message
-            elif isinstance(message, Frame):
-                pose = self._classify(message)
-                if pose is not None:
-                    found.append(pose)
+            elif isinstance(message, Frame) and (pose := self._pose(message)) is not None:
+                found.append(pose)
         if error is not None:
             raise error
         return found
 
-    def _classify(self, frame: Frame) -> Pose | None:
-        body = next(iter(frame.bodies), None)
+    def _pose(self, frame: Frame) -> Pose | None:
+        """Return the body's pose in a frame; None where it was not seen."""
         taken = self._frame_clock.taken(frame.received, frame.number, frame.rate, frame.latency)
-        verdict = self._classifier.classify(taken, body, frame.number)
-        if verdict is not Verdict.GOOD or body is None:
-            self.fault = str(verdict)
+        if not frame.bodies:
+            self.fault, self.hidden = str(Verdict.OCCLUDED), self.hidden + 1
             return None
-        self.fault = ""
-        if taken < self._next:
-            return None
-        period = 1 / (self._limits.rate * _RATE_SLACK)
-        self._next = max(self._next, taken - period) + period
-        return Pose(taken, frame.received, body.position, body.quaternion)
+        self.fault, body = "", frame.bodies[0]
+        return Pose(taken, frame.received, body.position, body.quaternion, frame.number)
+
+    def _look(self, check: PoseCheck) -> None:
+        """Read poses for the first call of `poses`, and check that they are upright and in metres."""
+        for pose in self._read():
+            self._first.append(pose)
+            if check.judge(pose.time, pose, pose.number) is Verdict.GOOD:
+                _check_looks(pose, str(self._uri))
 
     # Messages about what is wrong.
 
@@ -166,9 +152,9 @@ class MocapSource:
                 "or use vicon://, which takes the root segment",
             )
 
-    def _nothing_came(self) -> CfplanError:
+    def _nothing_came(self, check: PoseCheck) -> CfplanError:
         assert self._feed is not None
-        counts = self.counts
+        counts = check.counts + Counter({Verdict.OCCLUDED: self.hidden})
         total = counts.total()
         where = str(self._uri)
         if not total:

@@ -11,7 +11,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.clock import FrameClock
 from cfplan.flight.mocap.feed import Feed
 from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
-from cfplan.flight.mocap.pose_classifier import PoseClassifier, Verdict
+from cfplan.flight.mocap.pose_check import PoseCheck, Verdict
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
 from cfplan.vehicle.rotations import tilt_of, yaw_of
@@ -81,7 +81,7 @@ class Surveyor:
         self._missing = 0
         self._last: Frame | None = None
         self._clock = FrameClock(0.0)
-        self._classifiers: dict[str, PoseClassifier] = {}
+        self._checks: dict[str, PoseCheck] = {}
         self._bodies: dict[str, TrackedBody] = {}
         self.scene: Scene | None = None
 
@@ -102,7 +102,7 @@ class Surveyor:
         seen = {body.name: body for body in frame.bodies}
         self._bodies |= seen
         for name in [*seen, *frame.hidden]:
-            self._classifiers.setdefault(name, PoseClassifier(_JUMP)).classify(taken, seen.get(name), frame.number)
+            self._checks.setdefault(name, PoseCheck(_JUMP)).judge(taken, seen.get(name), frame.number)
 
     def report(self) -> Survey:
         """Return the survey so far."""
@@ -129,12 +129,12 @@ class Surveyor:
 
     def _names(self) -> list[str]:
         known = [subject.name for subject in self.scene.subjects] if self.scene else []
-        return known + sorted(self._classifiers.keys() - set(known))
+        return known + sorted(self._checks.keys() - set(known))
 
     def _body(self, name: str) -> BodyReport:
         subjects = self.scene.subjects if self.scene else ()
         segments = next((subject.segments for subject in subjects if subject.name == name), ())
-        counts: Counter[Verdict] = self._classifiers[name].counts if name in self._classifiers else Counter()
+        counts: Counter[Verdict] = self._checks[name].counts if name in self._checks else Counter()
         body = self._bodies.get(name)
         quaternion = body.quaternion if body else (math.nan,) * 4
         return BodyReport(

@@ -17,10 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
-from cfplan.flight.mocap.dead_reckoning import SensedMotion
-from cfplan.flight.mocap.pose_gate import PoseGate
-from cfplan.flight.mocap.pose_predictor import FARTHEST, PosePredictor
-from cfplan.flight.mocap.pose_steps import SMALLEST, PoseSteps
+from cfplan.flight.mocap.pose_tracker import PoseTracker
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, fault_abort, ordered
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
@@ -44,13 +41,8 @@ from cfplan.vehicle.rotations import yaw_of
 TRIES = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 MOTOR_TEST_PERIOD = 0.1  # s between two questions whether a motor test is on
-_RECENT = 1.0  # s of good poses that are kept
-VELOCITY_MISMATCH = 0.2
-"""m/s, horizontal: difference between the velocities of poses and estimate, in slow flight, above which poses are
-distrusted if it lasts. In the virtual lab it is 0.05, in wind 0.15, and 0.4 once the vehicle cannot be held."""
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
 _BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
-_FEWEST_HEIGHTS = 3  # that tell whether a body rests
 _STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
@@ -91,10 +83,8 @@ class FlightLoop:
     ):
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
         self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
-        self._monitor, self._pose_gate = AbortMonitor(mission.limits), PoseGate(mission.limits.pose.jump)
+        self._monitor, self.tracker = AbortMonitor(mission.limits), PoseTracker(mission.limits.pose)
         self._health_monitor, self.health = HealthMonitor(mission.limits.pose), Health()
-        self._predictor, self._sensed = PosePredictor(), SensedMotion()
-        self._steps = PoseSteps(mission.limits.pose.jump)
         self._deadlines = Deadlines(mission.rate, clock)
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
@@ -111,15 +101,10 @@ class FlightLoop:
         self._faults = set[str]()  # steps of a tick that have failed
         self._just_sent = -1  # number of the last setpoint of the plan that was sent; -1 before the first
         self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
-        self.pose_fault = ""  # why the last pose was not good
+        self.pose_fault = ""  # why no good pose comes
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
-        self._mismatch_since = math.inf  # s, since when the velocities of poses and estimate have differed
-        self.distrusted = ""  # why poses are ignored for the rest of the flight; empty while they are trusted
-        self._source_fault = ""
-        self._log_since = -math.inf  # s, since when the vehicle's log has come without a gap, in flight
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
         self._asked_motor_test = math.inf  # s, when the vehicle was last asked whether a motor test is on
-        self.recent: deque[Pose] = deque()  # the good poses of the last second
         self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
 
     # Connecting, and what the loop serves.
@@ -340,7 +325,7 @@ class FlightLoop:
         self.health = self._health_monitor.look(
             now,
             uplink=link.acknowledged,
-            poses=-math.inf if self.distrusted else self._forwarded,
+            poses=-math.inf if self.tracker.distrusted else self._forwarded,
             estimate=link.estimate.time if link.estimate is not None else -math.inf,
             status=link.status.time if link.status is not None else -math.inf,
         )
@@ -365,69 +350,27 @@ class FlightLoop:
                 self.history.say(Level.ERROR, f"pose: {self.pose_fault}")
 
     def _forward_poses(self) -> None:
-        newest, estimate = None, self.link.estimate
-        self._sensed.note(estimate, self.link.status)
-        if not self.airborne or estimate is None or self.health.estimate is not FRESH:
-            estimate, self._log_since = None, self.now()
-        else:
-            self._source.tell_attitude(estimate.quaternion)
+        tracker, link, step = self.tracker, self.link, self.tracker.step
+        fresh = self.health.estimate is FRESH
+        tracker.sense(self.now(), link.estimate, link.status, airborne=self.airborne, fresh=fresh)
         for pose in self._source.poses():
-            self.history.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
-            fault = self.distrusted or self._pose_gate.fault(pose, self._believed(estimate, pose.time))
-            if fault != self.pose_fault:
-                self.pose_fault = fault
-                self.history.say(Level.WARNING, f"pose: {fault}" if fault else "pose: good again")
-            if not fault:
-                newest = pose
-                self.recent.append(pose)
-                self._predictor.add(self._smooth(pose))
+            if tracker.take(pose):
+                self.history.report(PoseReceived(pose.time, pose.received, pose.position, pose.quaternion))
+            if tracker.last is pose:
                 self._note_deviation(pose)
-        if self._source.fault != self._source_fault:
-            self._source_fault = self._source.fault
-            self.history.say(Level.WARNING, f"motion capture: {self._source_fault or 'good again'}")
+        if tracker.step and not step:
+            self.history.say(Level.WARNING, f"pose: a step of {tracker.step:.2f} m reaches the vehicle slowly")
         now = self.now()
-        if newest is not None and now - newest.time < self.limits.pose.age_brake:
-            self._send_pose(newest, now)
-        self._compare_motion(now)
-        while len(self.recent) > 1 and self.recent[0].time < self.recent[-1].time - _RECENT:
-            self.recent.popleft()
-
-    def _smooth(self, pose: Pose) -> Pose:
-        """Return a good pose without its step, in the air, from where the last ones led."""
-        if not self.airborne:
-            return pose
-        led, stepped = self._predictor.position(pose.time), self._steps.kept_back
-        expected: Triple | None = led
-        off = math.dist(pose.position, led)
-        if off > SMALLEST:  # then by what the vehicle's sensors say, too
-            reckoned = self._sensed.reckon(self._predictor, pose.time)
-            expected = reckoned[0] if reckoned is not None else None
-        smoothed = self._steps.smooth(pose, expected)
-        if self._steps.kept_back and not stepped:
-            self.history.say(Level.WARNING, f"pose: stepped {off:.2f} m, which the vehicle gets to know slowly")
-        return smoothed
-
-    def _send_pose(self, newest: Pose, now: float) -> None:
-        """Send the newest pose, carried on to now. A late one is sent only if it is known what happened since."""
-        position, quaternion = self._predictor.position(now), newest.quaternion
-        if self.airborne and now - newest.time > FARTHEST:
-            reckoned = self._sensed.reckon(self._predictor, now)
-            turned = self._sensed.turn(quaternion, newest.time, now)
-            if reckoned is None or turned is None:
-                return
-            position, quaternion = reckoned[0], turned
-        self.link.send_pose(position, quaternion)
-        self._forwarded = newest.time
-
-    def _believed(self, estimate: Estimate | None, time: float) -> Triple | None:
-        """Return where the vehicle believes that it was, m; None unless its log has come since before the last pose.
-
-        Where the radio was dead meanwhile, poses that waited in it came late and spoilt its estimate.
-        """
-        last = self._pose_gate.last
-        if estimate is None or last is None or last.time < self._log_since:
-            return None
-        return estimate.position_at(time)
+        sent = tracker.to_send(now)
+        if sent is not None and tracker.last is not None:
+            link.send_pose(*sent)
+            self._forwarded = tracker.last.time
+        slow = self._tolerated is Rung.NONE and not (self.history.first_setpoint or self._left_alone)
+        tracker.compare_motion(now, self.limits.flight.patience, slow=slow)
+        why = tracker.distrusted or self._source.fault or tracker.fault
+        if why != self.pose_fault:
+            self.pose_fault = why
+            self.history.say(Level.WARNING, f"pose: {why or 'good again'}")
 
     def _note_deviation(self, pose: Pose) -> None:
         moment = pose.time - self.mission.lead
@@ -453,11 +396,11 @@ class FlightLoop:
             raise LinkLost
         if not self.airborne or self._stopped():
             return
-        pose = self._pose_gate.last
+        pose = self.tracker.last
         observation = Observation(
             now=now,
             pose=pose,
-            pose_fault=self.distrusted or self._source.fault or self.pose_fault,
+            pose_fault=self.pose_fault,
             health=self.health,
             wanted=self.wanted(pose.time) if pose is not None else None,
             estimate=estimate,
@@ -473,32 +416,6 @@ class FlightLoop:
         """Raise AbortRaised unless the abort is tolerated."""
         if abort.rung > self._tolerated:
             raise AbortRaised(abort)
-
-    def _compare_motion(self, now: float) -> None:
-        """Distrust all poses once their velocity has differed from the estimate's for `flight.patience`.
-
-        The axes of the tracked body are then not the vehicle's, or it is another body. The vehicle cannot be held by
-        such poses, but it can land by its own sensors. Only take-off and the way to the start are checked: they are
-        slow, so little else explains the difference. On the floor, the body's yaw cannot be observed.
-        """
-        estimate, then = self.link.estimate, self._predictor.middle
-        off = 0.0
-        if (
-            self.airborne
-            and self._tolerated is Rung.NONE
-            and not (self.history.first_setpoint or self._left_alone)
-            and estimate is not None
-            and self.health.estimate is FRESH
-            and now - self.pose().time <= self.limits.pose.age_warning
-            and not math.isnan(then)
-        ):
-            off = math.dist(self._predictor.velocity()[:2], estimate.velocity_at(then)[:2])
-        self._mismatch_since = min(self._mismatch_since, now) if off > VELOCITY_MISMATCH else math.inf
-        if now - self._mismatch_since >= self.limits.flight.patience and not self.distrusted:
-            self.distrusted = (
-                f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
-                "are its axes the vehicle's?"
-            )
 
     def _stopped(self) -> bool:
         """Return whether the motors stand, as they are meant to."""
@@ -543,19 +460,17 @@ class FlightLoop:
 
     def pose(self) -> Pose:
         """Return the last good pose; there is one once the feed has begun."""
-        pose = self._pose_gate.last
+        pose = self.tracker.last
         assert pose is not None
         return pose
 
     def seen(self) -> tuple[Triple, Triple, float]:
         """Return position, m, velocity, m/s, and yaw, rad, now, by the last good poses."""
-        return self._predictor.position(self.now()), self._predictor.velocity(), yaw_of(self.pose().quaternion)
+        return self.tracker.position(self.now()), self.tracker.velocity, yaw_of(self.pose().quaternion)
 
     def heights(self, duration: float) -> list[float]:
         """Return the heights, m, of the good poses of the last `duration`, s; none if they do not reach back as far."""
-        since = self.now() - duration
-        heights = [pose.position[2] for pose in self.recent if pose.time > since]
-        return heights if len(heights) >= _FEWEST_HEIGHTS and self.recent[0].time <= since else []
+        return self.tracker.heights(self.now() - duration)
 
     @property
     def blind_for(self) -> float:

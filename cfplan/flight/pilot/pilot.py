@@ -61,7 +61,7 @@ class Pilot:
             self._history.say(Level.ERROR, reason)
         finally:
             self._finish()
-        last_pose = loop.recent[-1] if loop.recent else None
+        last_pose = loop.tracker.recent[-1] if loop.tracker.recent else None
         return self._history.outcome(loop.motion_ends + self._mission.lead, exit_code, reason, last_pose)
 
     def _fly(self) -> tuple[ExitCode, str]:

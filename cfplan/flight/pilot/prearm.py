@@ -79,7 +79,7 @@ def _configure(loop: FlightLoop) -> dict[str, float]:
 def _feed(loop: FlightLoop) -> None:
     loop.history.enter(Phase.FEED)
     loop.open_poses()
-    if not loop.until(lambda: len(loop.recent) >= 20, 5.0):
+    if not loop.until(lambda: len(loop.tracker.recent) >= 20, 5.0):
         raise InputError(
             f"no good pose comes: {loop.pose_fault}" if loop.pose_fault else "no pose comes",
             where="motion capture",
@@ -152,7 +152,7 @@ def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> Preflig
         traffic=traffic,
         status=link.status,
         parameters=read,
-        poses=tuple(loop.recent),
+        poses=tuple(loop.tracker.recent),
         pose_age=loop.now() - loop.pose().time,
         stood=stood,
         estimate=link.estimate,

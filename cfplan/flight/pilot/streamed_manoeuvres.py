@@ -99,7 +99,7 @@ class StreamedManoeuvres:
         A vehicle that was left alone is no longer on its path, and one whose poses are distrusted never was.
         """
         loop, left = self._loop, self._loop.stream
-        if left is None or self._landing.begun or loop.descent is Descent.HELD or loop.distrusted:
+        if left is None or self._landing.begun or loop.descent is Descent.HELD or loop.tracker.distrusted:
             return
         if left.stop_from is not None:
             stop = left.stop_from(self._present_index(left))

@@ -1,8 +1,8 @@
 """The virtual lab in its own process: a virtual Crazyflie and a room with motion capture, in real time.
 
-The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; the room's poses
-come from the next port. More vehicles may be in the room, each with two ports of its own; they do not collide. The lab
-ends with the process that started it.
+The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; poses come from the
+room's virtual Vicon. More vehicles may be in the room, each with a port of its own; they do not collide. The lab ends
+with the process that started it.
 
 A lab announces its address in the environment variable CFPLAN_SIM_n, because `sim://n` alone must find it: cflib makes
 its link drivers itself, from nothing but the URI, in the pilot's process and in users' scripts.
@@ -31,7 +31,6 @@ from cfplan.simulation.virtual_vicon.faults import ViconFault
 from cfplan.vehicle.airframe import Airframe
 
 TRUTH, LATEST, CLOSE = "truth", "latest", "close"
-PORTS = 2  # of each vehicle
 Fault = VehicleFault | RadioFault | ViconFault
 _START_TIMEOUT = 180.0  # s; the first start on a machine compiles
 _ANSWER_TIMEOUT = 10.0  # s
@@ -88,7 +87,7 @@ class Lab:
         self.uri = f"sim://{number}"
         self.ports = ports  # of the vehicle, and of each other one in its room
         self.port = ports[0]
-        self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" if the room has none
+        self.mocap_uri = mocap_uri  # of the vehicle in the virtual Vicon; "" where poses are on board
         self._process = process
         self._connection = connection
         self._address = f"127.0.0.1:{self.port}"
@@ -177,8 +176,7 @@ class StartingLab:
         if isinstance(answer, CfplanError):
             raise answer
         ports, vicon_port = answer
-        cameras = self._room.vicon
-        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{cameras.subject}" if cameras is not None else ""
+        mocap_uri = f"vicon://127.0.0.1:{vicon_port}/{self._room.vicon.subject}" if vicon_port is not None else ""
         self._lab = Lab(self._process, self._connection, self._number, ports, mocap_uri)
         return self._lab
 
@@ -237,8 +235,8 @@ def start_lab(
 ) -> Lab:
     """Start a lab with a vehicle of this airframe as `sim://number`, and as `udp://127.0.0.1:port`; 0 takes a free one.
 
-    `companions` are more of them in its room, by their names in its virtual Vicon; each has the second port from the
-    one before. Raises LinkError if the lab does not start, InputError if a port that it needs is taken.
+    `companions` are more of them in its room, by their names in its virtual Vicon; their ports follow. Raises LinkError
+    if the lab does not start, InputError if a port that it needs is taken.
 
     A lab that had that number is hidden until this one is closed. A plain child process rather than one of
     multiprocessing's, so that it can be started from a daemonic process and from a script without a main guard.

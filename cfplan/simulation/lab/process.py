@@ -9,7 +9,6 @@ import struct
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -17,20 +16,19 @@ import numpy as np
 from cfplan.errors import CfplanError, InputError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.real_time import lock_memory
-from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, PORTS, ROW_SIZE, STATE, SUPERVISOR, TIME
+from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME
 from cfplan.simulation.lab.radio import Radio, RadioFault
-from cfplan.simulation.lab.room import SUBSCRIBE, SUBSCRIPTION_LASTS, MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
+from cfplan.simulation.virtual_vicon.cameras import Cameras
 from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
 from cfplan.simulation.virtual_vicon.vicon import VirtualVicon
 from cfplan.vehicle.airframe import Airframe
 
 _WARM_UP = 200  # ms
-_VICON_STEP = 2  # ms between wakes for the virtual Vicon
 _RECORD_PERIOD = 10  # ms
 _LARGEST_LAG = 0.25  # s of a stall that are caught up with; beyond, simulated time is lost
 _SILENCE = 2.0  # s after which a client has gone
@@ -62,32 +60,30 @@ class Recorder:
 
 
 class LabLoop:
-    """Vehicle, room and sockets on one clock; and the loops of other vehicles in that room."""
+    """A vehicle and its socket on one clock; that of the first vehicle has the room's cameras and the other loops."""
 
     def __init__(
         self,
         airframe: Airframe,
         vehicle: VehicleSettings,
-        room: RoomSettings,
+        *,
+        on_board: bool = False,
         port: int = 0,
         clock: Clock = REAL_CLOCK,
     ):
-        self.companions: Mapping[str, LabLoop] = {}  # by the names that the virtual Vicon has for them
+        self.companions: Mapping[str, LabLoop] = {}  # by the names that the cameras have for them
+        self.cameras: Cameras | None = None  # a VirtualVicon serves their pictures; others go on board
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
         self._clock = clock
         self._seed = vehicle.seed
-        self._on_board = room.on_board
-        if room.on_board:
+        if on_board:
             self.vehicle.use_kalman()
         self._warm_up()
-        self.capture = MotionCapture(room, begin=self.vehicle.tick)
-        self.vicon: VirtualVicon | None = None
         self.record = Recorder()
-        self.link, self.poses = _sockets_at(port) if port else _adjacent_sockets()
+        self.link = _socket_at(port)
         self.port: int = self.link.getsockname()[1]
         self._client: _Address | None = None
         self._heard = 0.0
-        self._subscribers: dict[_Address, float] = {}
         self._origin = math.nan  # s, when the vehicle's tick 0 was
         self._radio: Radio | None = None  # None while the link is perfect
 
@@ -99,8 +95,7 @@ class LabLoop:
     def run(self, control: Connection) -> None:
         """Run until told to end, or until the parent process has ended."""
         parent, loops = os.getppid(), self.loops
-        sources: list[int] = [each.fileno() for loop in loops for each in (loop.link, loop.poses)]
-        sources.append(control.fileno())
+        sources = [*(loop.link.fileno() for loop in loops), control.fileno()]
         for loop in loops:
             loop.serve()
         while os.getppid() == parent:
@@ -116,12 +111,11 @@ class LabLoop:
         return self, *self.companions.values()
 
     def serve(self) -> None:
-        """Do what is due by now, for the vehicle, the room and the sockets."""
+        """Do what is due by now, for the vehicle, the cameras and the sockets."""
         if math.isnan(self._origin):
             self._origin = self._clock.now() - self.vehicle.tick / 1000
         self._catch_up()
         self._read_link()
-        self._read_subscriptions()
 
     def until_due(self) -> float:
         """Return s until `serve` is needed again, unless a packet comes sooner."""
@@ -132,11 +126,15 @@ class LabLoop:
         tick = self.vehicle.tick
         if self._radio is not None and self._radio.busy:
             return self._origin + (tick + 1) / 1000
-        if self.vicon is not None:
-            return min(self._origin + (tick + _VICON_STEP) / 1000, self.capture.next_due)
         boundary = -(-tick // COMMANDER_PERIOD) * COMMANDER_PERIOD
-        after = min(boundary, self.capture.next_tick) + 1
-        return min(self._origin + after / 1000, self.capture.next_due)
+        after = min(boundary, self._next_look()) + 1
+        return min(self._origin + after / 1000, self.cameras.next_due if self.cameras is not None else math.inf)
+
+    def _next_look(self) -> float:
+        """Return the tick at which the cameras look next; infinity without cameras."""
+        if self.cameras is None:
+            return math.inf
+        return max(self.vehicle.tick, math.ceil((self.cameras.next_look - self._origin) * 1000))
 
     def _catch_up(self) -> None:
         now = self._clock.now()
@@ -155,27 +153,34 @@ class LabLoop:
     def _run_to(self, target: int) -> None:
         while self.vehicle.tick < target:
             tick = self.vehicle.tick
-            if tick >= self.capture.next_tick:
-                self.capture.look(self._origin + tick / 1000, self.vehicle.stabilizer.loop.truth)
             self._look(self._origin + tick / 1000)
             if tick % _RECORD_PERIOD == 0:
                 self.record.note(self._origin + tick / 1000, self.vehicle)
-            stop = min(target, self.capture.next_tick, tick + _RECORD_PERIOD - tick % _RECORD_PERIOD)
-            if self.vicon is not None:
-                stop = min(stop, max(tick + 1, math.ceil((self.vicon.next_look - self._origin) * 1000)))
-            self.vehicle.advance(stop - tick)
+            stop = min(target, tick + _RECORD_PERIOD - tick % _RECORD_PERIOD, max(self._next_look(), tick + 1))
+            self.vehicle.advance(int(stop) - tick)
 
     def _look(self, now: float) -> None:
-        """Let the virtual Vicon see the vehicles when it is due."""
-        if self.vicon is not None and now >= self.vicon.next_look:
+        """Let the cameras see the vehicles when it is due."""
+        if self.cameras is not None and now >= self.cameras.next_look:
             truth = self.vehicle.stabilizer.loop.truth.tolist()
             others = {name: loop.pose_at(now) for name, loop in self.companions.items()}
-            self.vicon.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]), others)
+            self.cameras.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]), others)
+
+    def _show_pictures(self, now: float) -> None:
+        """Let the virtual Vicon serve, or give each vehicle its pose on board."""
+        if isinstance(self.cameras, VirtualVicon):
+            self.cameras.step(now)
+        elif self.cameras is not None:
+            for picture in self.cameras.due(now):
+                for loop, body in zip(self.loops, picture.bodies, strict=False):
+                    if body.pose is not None:
+                        position, quaternion = body.pose
+                        pose = EXTERNAL_POSE + struct.pack("<7f", *position, *quaternion)
+                        loop.vehicle.receive(pack(Port.LOCALIZATION, 1, pose))
 
     def _send_out(self, now: float) -> None:
         packets = self.vehicle.sent()
-        if self.vicon is not None:
-            self.vicon.step(now)
+        self._show_pictures(now)
         if self._client is not None and now - self._heard > _SILENCE:
             self._client = None
         if self._radio is not None:
@@ -187,15 +192,6 @@ class LabLoop:
         if self._client is not None:
             for packet in packets:
                 self.link.sendto(packet, self._client)
-        for packet in self.capture.ready(now):
-            if self._on_board:
-                pose = EXTERNAL_POSE + struct.pack("<7f", *self.capture.measured(packet))
-                self.vehicle.receive(pack(Port.LOCALIZATION, 1, pose))
-            for address, renewed in list(self._subscribers.items()):
-                if now - renewed > SUBSCRIPTION_LASTS:
-                    del self._subscribers[address]
-                else:
-                    self.poses.sendto(packet, address)
 
     def _read_link(self) -> None:
         came = _datagrams(self.link)
@@ -211,13 +207,6 @@ class LabLoop:
         if came:
             self._send_out(self._clock.now())
 
-    def _read_subscriptions(self) -> None:
-        for packet, sender in _datagrams(self.poses):
-            if packet == SUBSCRIBE:
-                self._subscribers[sender] = self._clock.now()
-            else:
-                self._subscribers.pop(sender, None)
-
     def _obey(self, control: Connection) -> bool:
         try:
             request = control.recv()
@@ -227,8 +216,8 @@ class LabLoop:
             what, number = request
             loop = self.loops[number]
             control.send((loop.record.rows(-1 if what == LATEST else 0), loop.vehicle.supervisor.ever_locked))
-        elif isinstance(request, ViconFault) and self.vicon is not None:
-            self.vicon.inject(request, self._clock.now())
+        elif isinstance(request, ViconFault) and self.cameras is not None:
+            self.cameras.inject(request, self._clock.now())
         elif isinstance(request, VehicleFault):
             self.vehicle.inject(request)
         elif isinstance(request, RadioFault):
@@ -246,57 +235,38 @@ def _datagrams(source: socket.socket) -> list[tuple[bytes, _Address]]:
             return found
 
 
-def _adjacent_sockets() -> tuple[socket.socket, socket.socket]:
-    """Return two UDP sockets on the loopback, the second one port above the first."""
-    while True:
-        first = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        first.bind(("127.0.0.1", 0))
-        second = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            second.bind(("127.0.0.1", first.getsockname()[1] + 1))
-        except (OSError, OverflowError):
-            first.close()
-            second.close()
-            continue
-        first.setblocking(False)
-        second.setblocking(False)
-        return first, second
-
-
-def _sockets_at(port: int) -> tuple[socket.socket, socket.socket]:
-    """Return the same two sockets at a port. Raises InputError if it is not available."""
-    found = []
-    for number in (port, port + 1):
-        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        try:
-            made.bind(("127.0.0.1", number))
-        except (OSError, OverflowError) as why:
-            raise InputError(
-                f"port {number} is not available: {why}", where="virtual vehicle", hint="choose another with --port"
-            ) from why
-        made.setblocking(False)
-        found.append(made)
-    return found[0], found[1]
+def _socket_at(port: int) -> socket.socket:
+    """Return a UDP socket on the loopback, at a free port if that is 0. Raises InputError if it is not available."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        made.bind(("127.0.0.1", port))
+    except (OSError, OverflowError) as why:
+        made.close()
+        raise InputError(
+            f"port {port} is not available: {why}", where="virtual vehicle", hint="choose another with --port"
+        ) from why
+    made.setblocking(False)
+    return made
 
 
 def serve(control: Connection) -> None:
     """Make the lab that the parent asks for, tell it the port, and run the lab."""
     airframe, vehicle, companions, room, port = control.recv()
     try:
-        loop = LabLoop(airframe, vehicle, room, port)
+        loop = LabLoop(airframe, vehicle, on_board=room.on_board, port=port)
         loop.companions = {
-            name: LabLoop(airframe, settings, replace(room, seed=room.seed + number), port and port + PORTS * number)
+            name: LabLoop(airframe, settings, on_board=room.on_board, port=port and port + number)
             for number, (name, settings) in enumerate(companions.items(), start=1)
         }
-        if room.vicon is not None:
-            loop.vicon = VirtualVicon(room.vicon, REAL_CLOCK.now())
+        loop.cameras = (Cameras if room.on_board else VirtualVicon)(room.vicon, REAL_CLOCK.now())
     except CfplanError as error:
         control.send(error)
         return
     gc.collect()
     gc.freeze()
     _take_priority()
-    control.send((tuple(each.port for each in loop.loops), loop.vicon.port if loop.vicon is not None else None))
+    vicon_port = loop.cameras.port if isinstance(loop.cameras, VirtualVicon) else None
+    control.send((tuple(each.port for each in loop.loops), vicon_port))
     loop.run(control)
 
 

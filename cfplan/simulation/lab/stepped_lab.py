@@ -1,6 +1,6 @@
 """The stepped lab, without real time: vehicle, radio and cameras on a clock that runs only while the pilot sleeps.
 
-It has the same virtual Crazyflie, packets, pose classification and pilot as a lab of processes, in one thread: every
+It has the same virtual Crazyflie, packets, pose tracker and pilot as a lab of processes, in one thread: every
 flight can be repeated to the last bit, and takes a fraction of its time.
 """
 

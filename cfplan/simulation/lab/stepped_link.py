@@ -189,7 +189,7 @@ class SteppedPoses(MocapSource):
                 else:
                     bodies.append(TrackedBody(shown.name, *shown.pose))
             frame = Frame(received, tuple(bodies), tuple(hidden), picture.number, picture.rate, picture.latency)
-            pose = self._classify(frame)
+            pose = self._pose(frame)
             if pose is not None:
                 found.append(pose)
         return found

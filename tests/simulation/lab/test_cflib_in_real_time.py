@@ -9,26 +9,28 @@ import numpy as np
 import pytest
 from cflib.crazyflie.mem import MemoryElement, Poly4D
 from cflib.crtp.crtpstack import CRTPPort
-from waiting import until
+from waiting import PATIENCE, until
 
+from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
 from cfplan.geometry.path_file import path_through
 from cfplan.geometry.polynomial_csv import polynomial_rows
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.lab.room import RoomPoseSource
 from cfplan.vehicle.airframes import AIRFRAMES
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+SAFETY_FILE = Path(__file__).parents[3] / "safety.yaml"
 
 
 class PoseFeed(threading.Thread):
     """What a pilot does with poses, in short."""
 
-    def __init__(self, cf):
+    def __init__(self, cf, mocap_uri):
         super().__init__(daemon=True)
-        self.cf, self.source, self.stop = cf, RoomPoseSource(), threading.Event()
+        self.cf, self.stop = cf, threading.Event()
+        self.source = pose_source(mocap_uri, load_limits(SAFETY_FILE).pose, open_within=PATIENCE)
         self.source.open()
         self.start_position = self.source.poses()[-1].position
         self.latest = None
@@ -124,7 +126,7 @@ def from_csv(made):
 
 def uploads(make, elements=packed):
     """Upload a plan, and let the vehicle fly it by itself."""
-    limits = load_limits(Path(__file__).parents[3] / "safety.yaml")
+    limits = load_limits(SAFETY_FILE)
     gentle = replace(limits.plan, angular_acceleration=0.57 * limits.plan.angular_acceleration)
     path = path_through([[-0.8, -0.8, 0.7], [0.2, 0.4, 1.1], [1.0, -0.6, 0.9]]).path
     made = make(plan(path, limits.airframe, replace(limits, plan=gentle)).trajectory, limits)
@@ -168,7 +170,7 @@ def test_cflib_flies_the_virtual_crazyflie(lab, link, set_and_read_back, make_fl
     flight, codes = make_flight(), []
     assert until(lambda: link.supervisor.can_fly)  # some seconds after the flight before
     link.add_port_callback(CRTPPort.SETPOINT_HL, lambda packet: codes.append(packet.data[3]))
-    feed = PoseFeed(link)
+    feed = PoseFeed(link, lab.mocap_uri)
     prepare(link, feed, set_and_read_back)
     flight(lab, link, feed)
     assert codes == [0] * commands

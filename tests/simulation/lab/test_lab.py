@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -23,9 +22,10 @@ from cfplan.errors import InputError, LinkError
 from cfplan.flight.clock import SteppedClock
 from cfplan.simulation.lab.lab import ROW_SIZE, start_lab
 from cfplan.simulation.lab.process import LabLoop
-from cfplan.simulation.lab.room import RoomPoseSource, RoomSettings, lab_address
+from cfplan.simulation.lab.room import lab_address
 from cfplan.simulation.lab.sim_driver import SimDriver, register_sim_driver
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 
 pytestmark = pytest.mark.integration
@@ -144,9 +144,10 @@ def test_a_link_without_a_lab_brings_its_own(monkeypatch):
 def stepped(monkeypatch):
     """Makes the loop of a lab, which runs on a stepped clock as sim://4; returns both."""
 
-    def make(room=None, **settings):
+    def make(cameras=None, **settings):
         clock = SteppedClock()
-        loop = LabLoop(AIRFRAME, VehicleSettings(**settings), room or RoomSettings(), clock=clock)
+        loop = LabLoop(AIRFRAME, VehicleSettings(**settings), on_board=cameras is not None, clock=clock)
+        loop.cameras = Cameras(cameras, clock.now()) if cameras is not None else None
         monkeypatch.setenv("CFPLAN_SIM_4", f"127.0.0.1:{loop.port}")
 
         def serve():
@@ -161,35 +162,12 @@ def stepped(monkeypatch):
     yield make
     for loop in opened:
         loop.link.close()
-        loop.poses.close()
 
 
-def test_poses_are_late_noisy_and_at_the_rate_that_was_set(stepped):
-    room = RoomSettings(rate=100, latency=0.03, position_noise=0.002)
-    _, clock = stepped(room, position=(1.0, 2.0, 0.0))
-    source = RoomPoseSource(number=4, clock=clock)
-    source.open()
-    poses = []
-    for _ in range(5000):
-        clock.sleep(0.002)
-        poses += source.poses()
-    source.close()
-    source.close()
-    times = np.array([pose.time for pose in poses])
-    places = np.array([pose.position for pose in poses])
-    assert len(poses) == pytest.approx(1000, abs=10)
-    assert np.allclose(np.diff(times), 0.01, atol=1e-6)
-    ages = np.array([pose.received - pose.time for pose in poses])
-    assert ages.min() > 0.0299
-    assert np.percentile(ages, 99) < 0.034
-    assert places.mean(axis=0) == pytest.approx([1.0, 2.0, 0.0], abs=5e-4)
-    assert places.std(axis=0) == pytest.approx([0.002] * 3, rel=0.1)
-
-
-def test_a_pose_source_goes_to_another_process():
-    source = pickle.loads(pickle.dumps(RoomPoseSource(number=4)))
-    assert source.poses() == []
-    source.close()
+def test_a_vehicle_with_poses_on_board_knows_where_it_stands(stepped):
+    loop, clock = stepped(ViconSettings(latency=0.03), position=(1.0, 2.0, 0.0))
+    clock.sleep(5.0)
+    assert loop.vehicle.stabilizer.loop.belief[:2].tolist() == pytest.approx([1.0, 2.0], abs=0.02)
 
 
 def test_a_vehicle_that_stands_still_is_recorded_a_hundred_times_a_second(stepped):
@@ -230,24 +208,6 @@ def test_a_lab_whose_computer_stood_still_loses_the_time_that_it_cannot_catch_up
     assert loop.vehicle.tick - before == pytest.approx(100, abs=11)
 
 
-def test_a_child_process_finds_the_room(lab):
-    program = textwrap.dedent(
-        """
-        import time
-        from cfplan.simulation.lab.room import RoomPoseSource
-        source = RoomPoseSource()
-        source.open()
-        found, end = 0, time.monotonic() + 60
-        while found <= 10 and time.monotonic() < end:
-            time.sleep(0.01)
-            found += len(source.poses())
-        print(found)
-        """
-    )
-    child = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
-    assert int(child.stdout) > 10
-
-
 def test_a_second_lab_of_a_number_hides_the_first_until_it_closes(lab):
     with start_lab(AIRFRAME) as second:
         assert lab_address(0) == ("127.0.0.1", second.port)
@@ -255,18 +215,11 @@ def test_a_second_lab_of_a_number_hides_the_first_until_it_closes(lab):
     assert lab_address(0) == ("127.0.0.1", lab.port)
 
 
-def test_without_a_lab_there_are_no_poses(monkeypatch):
-    with pytest.raises(LinkError, match="no simulated room"):
-        RoomPoseSource(number=9).open()
+def test_an_address_that_is_none_is_refused(monkeypatch):
+    assert lab_address(9) is None
     monkeypatch.setenv("CFPLAN_SIM_9", "somewhere")
     with pytest.raises(InputError):
-        RoomPoseSource(number=9).open()
-
-
-@pytest.mark.parametrize("settings", [{"rate": 0.0}, {"rate": np.nan}, {"latency": -1.0}, {"position_noise": np.inf}])
-def test_a_room_that_makes_no_sense_is_refused(settings):
-    with pytest.raises(InputError):
-        RoomSettings(**settings)
+        lab_address(9)
 
 
 def process_runs(number):

@@ -5,23 +5,22 @@ from collections.abc import Callable
 
 import pytest
 
-from cfplan.simulation.lab.room import MotionCapture, RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port, pack
+from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
-_POSE = struct.Struct("<dI7d")
 
 
 class Rig:
-    def __init__(self, settings: VehicleSettings | None = None, room: RoomSettings | None = None):
+    def __init__(self, settings: VehicleSettings | None = None, vicon: ViconSettings | None = None):
         self.airframe = AIRFRAME
         self.vehicle = VirtualCrazyflie(AIRFRAME, settings)
-        self.capture = MotionCapture(room or RoomSettings())
+        self.cameras = Cameras(vicon or ViconSettings(), 0.0)
         self.feeding = True
         self.received: list[bytes] = []
 
@@ -37,11 +36,12 @@ class Rig:
         end = self.vehicle.tick + round(seconds * 1000)
         while self.vehicle.tick < end:
             tick = self.vehicle.tick
-            if tick >= self.capture.next_tick:
-                self.capture.look(tick / 1000, self.truth)
-            for packet in self.capture.ready(tick / 1000 + 1e-9):
+            if tick / 1000 > self.cameras.next_look - 1e-9:
+                self.cameras.look(tick / 1000, tuple(self.truth[0:3]), tuple(self.truth[6:10]))
+            for picture in self.cameras.due(tick / 1000 + 1e-9):
                 if self.feeding:
-                    self.send(Port.LOCALIZATION, 1, b"\x08" + struct.pack("<7f", *_POSE.unpack(packet)[2:]))
+                    position, quaternion = picture.bodies[0].pose
+                    self.send(Port.LOCALIZATION, 1, b"\x08" + struct.pack("<7f", *position, *quaternion))
             if every_10_ms is not None:
                 every_10_ms(tick)
             self.vehicle.advance(min(10 - tick % 10, end - tick))

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from cfplan.flight.pilot.vehicle_rules import EXTERNAL_ATTITUDE_STD, EXTERNAL_POSITION_STD
 from cfplan.simulation.engine import kalman as estimator
 from cfplan.simulation.engine.kalman import Prior, estimate, new_filter, reset, step_filter
-from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_crazyflie.wire import Port
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.rotations import matrix_of
@@ -167,7 +167,7 @@ def test_without_poses_an_accelerometer_that_says_too_little_lifts_the_vehicle(m
     """Height and speed are off by a t² / 2 and a t: nothing on board corrects the accelerometer."""
     sensors = Sensors(gyro_noise=0.0, gyro_bias=0.0, acceleration_noise=0.0, acceleration_bias=(0.0, 0.0, 0.1))
     for seed in range(4):
-        rig = make_rig(VehicleSettings(seed=seed, sensors=sensors), RoomSettings(seed=seed, position_noise=0.0))
+        rig = make_rig(VehicleSettings(seed=seed, sensors=sensors), ViconSettings(seed=seed, position_noise=0.0))
         rig.prepare()
         rig.set("locSrv.extPosStdDev", EXTERNAL_POSITION_STD)
         rig.take_off()
@@ -183,7 +183,7 @@ def test_without_poses_an_accelerometer_that_says_too_little_lifts_the_vehicle(m
 def test_without_poses_a_hover_drifts_by_what_calibration_leaves(make_rig, after, least, most):
     errors = []
     for seed in range(6):
-        rig = make_rig(VehicleSettings(seed=seed), RoomSettings(seed=seed))
+        rig = make_rig(VehicleSettings(seed=seed), ViconSettings(seed=seed))
         rig.prepare()
         rig.take_off()
         rig.run(2.5)

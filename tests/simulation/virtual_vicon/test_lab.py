@@ -6,7 +6,7 @@ import socket
 import pytest
 from waiting import PATIENCE, until
 
-from cfplan.flight.mocap.pose_classifier import Verdict
+from cfplan.flight.mocap.pose_check import Verdict
 from cfplan.flight.mocap.source import pose_source
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.lab.lab import start_lab
@@ -27,7 +27,7 @@ LIMITS = PoseLimits(
 
 @pytest.fixture(scope="module")
 def lab():
-    room, beside = RoomSettings(vicon=ViconSettings(rate=200.0)), {"cf2": VehicleSettings(position=(0.5, 1.0, 0.0))}
+    room, beside = RoomSettings(ViconSettings(rate=200.0)), {"cf2": VehicleSettings(position=(0.5, 1.0, 0.0))}
     with start_lab(load_airframe("crazyflie-2.1+"), room=room, companions=beside, number=7) as lab:
         yield lab
 
@@ -62,7 +62,7 @@ def test_what_goes_wrong_is_told_to_the_running_lab(lab):
     source.open()
     try:
         lab.disturb(ViconFault(FaultKind.OCCLUDE, duration=0.5))
-        assert until(lambda: source.poses() is not None and source.counts[Verdict.OCCLUDED])
+        assert until(lambda: source.poses() is not None and source.fault == Verdict.OCCLUDED)
         assert until(lambda: source.poses())
         assert source.fault == ""
     finally:

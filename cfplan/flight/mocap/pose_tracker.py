@@ -1,0 +1,218 @@
+"""Tracker of the vehicle's poses: which of them are good, where the vehicle is now, and what to send to it.
+
+The vehicle's filter takes every pose as the truth of the moment at which it arrives. So the tracker makes up for three
+things, besides rejecting what `pose_check` finds to be no pose of the vehicle:
+
+*Latency.* A pose is some 15 ms old when it is sent: at 2 m/s the estimate would trail by 3 cm, and the controller would
+fly ahead by as much. A straight line through the last poses makes up for that; for an older pose, what the vehicle's
+sensors have measured since (`dead_reckoning`).
+
+*Steps.* Where a marker is hidden or a pattern is fitted otherwise, poses step by some centimetres in one frame, as no
+vehicle can. The filter explains such a step by a speed: 0.14 m along x made it believe 0.7 m/s otherwise for a fifth of
+a second. A tracked body that steps is often lost next, and then the vehicle flies on by that speed. So poses that step
+go to the vehicle from where they were expected, and come to where they are at a speed that does no harm.
+
+*Wrong axes.* If the axes of the tracked body are not the vehicle's, or it is another body, velocities of poses and
+estimate differ. Such poses cannot hold the vehicle, but it can land by its own sensors: all poses are distrusted then.
+"""
+
+import math
+from collections import Counter, deque
+from dataclasses import replace
+
+from cfplan.flight.mocap.dead_reckoning import SensedMotion
+from cfplan.flight.mocap.pose_check import PoseCheck, Verdict
+from cfplan.flight.mocap.poses import Pose
+from cfplan.flight.telemetry import Estimate, Quaternion, Triple, VehicleStatus
+from cfplan.safety.limits import PoseLimits
+
+MAX_EXTRAPOLATION = 0.05  # s that the line through the last poses is trusted beyond the last
+_LINE = 0.06  # s of poses that it is drawn through: 1 mm of noise gives 0.02 m/s at 100 Hz
+_FEWEST = 4  # poses that make a line
+_RECENT = 1.0  # s of good poses that are kept
+_FEWEST_HEIGHTS = 3  # that tell whether a body rests
+_RATE_SLACK = 1.2  # times the expected rate may be used; more only burdens the record
+
+SMALLEST_STEP = 0.02  # m beside where the last poses led, which counts as a step; the filter makes 0.1 m/s of it
+_LET_IN = 0.1  # m/s
+_STEP_GAP = 0.1  # s without a good pose, after which a step is as likely the vehicle's
+
+VELOCITY_MISMATCH = 0.2
+"""m/s, horizontal: difference between the velocities of poses and estimate, in slow flight, above which poses are
+distrusted if it lasts. In the virtual lab it is 0.05, in wind 0.15, and 0.4 once the vehicle cannot be held."""
+
+
+class PoseTracker:
+    """Tracks one vehicle from its poses, its sensed motion and the time.
+
+    Its attributes are for reading; methods change them.
+    """
+
+    def __init__(self, limits: PoseLimits):
+        self._limits = limits
+        self._check, self._sensed = PoseCheck(limits.jump), SensedMotion()
+        self._airborne = False
+        self._estimate: Estimate | None = None  # the vehicle's, in flight while its log comes
+        self._log_since = -math.inf  # s, since when that has come without a gap
+        self._next = -math.inf  # s, before which a pose comes too soon
+        self._line: deque[Pose] = deque()  # the last good poses, without their steps
+        self._offset: Triple = (0.0, 0.0, 0.0)  # m, added to poses: a step that is kept from the vehicle
+        self._smoothed = -math.inf  # s, time of the last pose in flight
+        self._unsent: Pose | None = None  # the newest good pose since `to_send`
+        self._mismatch_since = math.inf  # s, since when the velocities of poses and estimate have differed
+        self.recent: deque[Pose] = deque()  # the good poses of the last second
+        self.fault = ""  # why the last pose was not good
+        self.distrusted = ""  # why poses are ignored for the rest of the flight; empty while they are trusted
+        self.step = 0.0  # m, size of the step of which a part is still kept from the vehicle
+
+    @property
+    def last(self) -> Pose | None:
+        """Return the last good pose."""
+        return self.recent[-1] if self.recent else None
+
+    @property
+    def verdicts(self) -> Counter[Verdict]:
+        """Return how many poses had which verdict."""
+        return self._check.counts
+
+    def sense(
+        self, now: float, estimate: Estimate | None, status: VehicleStatus | None, *, airborne: bool, fresh: bool
+    ) -> None:
+        """Take the newest messages of the vehicle's log; `fresh` tells whether its estimate still comes."""
+        self._sensed.note(estimate, status)
+        self._airborne = airborne
+        self._estimate = estimate if airborne and fresh else None
+        if self._estimate is None:
+            self._log_since = now
+        else:
+            self._check.attitude = self._estimate.quaternion
+
+    def take(self, pose: Pose) -> bool:
+        """Judge a pose, and use it if it is good: `fault` is empty then.
+
+        Return whether it belongs in the record: it is the body's, and not one of more than the expected rate.
+        """
+        verdict = self._check.judge(pose.time, pose, pose.number, self._believed(pose.time))
+        self.fault = self.distrusted or ("" if verdict is Verdict.GOOD else str(verdict))
+        if verdict not in (Verdict.GOOD, Verdict.ASTRAY) or pose.time < self._next:
+            return False
+        period = 1.0 / (self._limits.rate * _RATE_SLACK)
+        self._next = max(self._next, pose.time - period) + period
+        if not self.fault:
+            self._use(pose)
+        return True
+
+    def _believed(self, time: float) -> Triple | None:
+        """Return where the vehicle believes that it was, m; None unless its log has come since before the last pose.
+
+        Where the radio was dead meanwhile, poses that waited in it came late and spoilt its estimate.
+        """
+        if self._estimate is None or self.last is None or self.last.time < self._log_since:
+            return None
+        return self._estimate.position_at(time)
+
+    def _use(self, pose: Pose) -> None:
+        self._line.append(self._without_step(pose) if self._airborne else pose)
+        while self._line[0].time < pose.time - _LINE:
+            self._line.popleft()
+        self._unsent = pose
+        self.recent.append(pose)
+        while self.recent[0].time < pose.time - _RECENT:
+            self.recent.popleft()
+
+    # Steps.
+
+    def _without_step(self, pose: Pose) -> Pose:
+        elapsed, self._smoothed = pose.time - self._smoothed, pose.time
+        if elapsed > _STEP_GAP:
+            self._offset, self.step = (0.0, 0.0, 0.0), 0.0
+            return pose
+        if self.step:
+            left = max(1.0 - _LET_IN * elapsed / math.hypot(*self._offset), 0.0)
+            x, y, z = self._offset
+            self._offset = left * x, left * y, left * z
+        led = self.position(pose.time)
+        off = math.dist(pose.position, led)
+        expected = led if off <= SMALLEST_STEP else self._reckoned(pose.time)  # then the sensors count, too
+        if expected is not None and math.dist(_sum(pose.position, self._offset), expected) > SMALLEST_STEP:
+            x, y, z = (wanted - seen for wanted, seen in zip(expected, pose.position, strict=True))
+            self._offset = x, y, z
+            if math.hypot(x, y, z) > self._limits.jump:  # too far to be kept back
+                self._offset = (0.0, 0.0, 0.0)
+                self._line.clear()  # a line across the step would show a speed
+        self.step = (self.step or off) if any(self._offset) else 0.0
+        return replace(pose, position=_sum(pose.position, self._offset)) if self.step else pose
+
+    # Where the vehicle is.
+
+    def position(self, now: float) -> Triple:
+        """Return the position, m, at a time, s, by the line through the last good poses. Needs one pose."""
+        last = self._line[-1]
+        ahead = min(max(now - last.time, 0.0), MAX_EXTRAPOLATION)
+        (x, y, z), (vx, vy, vz) = last.position, self.velocity
+        return x + ahead * vx, y + ahead * vy, z + ahead * vz
+
+    @property
+    def velocity(self) -> Triple:
+        """Return the slope of that line, m/s; zero while there are too few poses."""
+        line = self._fitted()
+        return line[1] if line is not None else (0.0, 0.0, 0.0)
+
+    def _fitted(self) -> tuple[float, Triple] | None:
+        """Return the time, s, in the middle of the line, and its slope, m/s; None while there are too few poses."""
+        count = len(self._line)
+        if count < _FEWEST:
+            return None
+        middle = sum([pose.time for pose in self._line]) / count
+        spread = x = y = z = 0.0
+        for pose in self._line:
+            off, (px, py, pz) = pose.time - middle, pose.position
+            spread += off**2
+            x, y, z = x + off * px, y + off * py, z + off * pz
+        return middle, (x / spread, y / spread, z / spread)
+
+    def _reckoned(self, now: float) -> Triple | None:
+        """Return the position, m, by the last good poses and what the sensors have measured since; None if unknown."""
+        line, last = self._fitted(), self._line[-1]
+        way = self._sensed.displacement(line[1], line[0], last.time, now) if line is not None else None
+        return _sum(last.position, way) if way is not None else None
+
+    def to_send(self, now: float) -> tuple[Triple, Quaternion] | None:
+        """Return the newest pose, carried on to `now`: position, m, and attitude; None if there is nothing to send.
+
+        Each pose is returned once. A late one counts only if it is known what happened since.
+        """
+        newest, self._unsent = self._unsent, None
+        if newest is None or now - newest.time >= self._limits.age_brake:
+            return None
+        if not self._airborne or now - newest.time <= MAX_EXTRAPOLATION:
+            return self.position(now), newest.quaternion
+        position, turned = self._reckoned(now), self._sensed.turn(newest.quaternion, newest.time, now)
+        return None if position is None or turned is None else (position, turned)
+
+    def heights(self, since: float) -> list[float]:
+        """Return the heights, m, of the good poses after a time, s; none if they do not reach back as far."""
+        heights = [pose.position[2] for pose in self.recent if pose.time > since]
+        return heights if len(heights) >= _FEWEST_HEIGHTS and self.recent[0].time <= since else []
+
+    # Distrust.
+
+    def compare_motion(self, now: float, patience: float, *, slow: bool) -> None:
+        """Distrust all poses once their velocity has differed from the estimate's for `patience`, s.
+
+        Only `slow` flight counts, where little else explains a difference. On the floor, the body's yaw cannot be
+        observed.
+        """
+        off, line = 0.0, self._fitted()
+        if slow and self._estimate is not None and line and now - self.recent[-1].time <= self._limits.age_warning:
+            off = math.dist(line[1][:2], self._estimate.velocity_at(line[0])[:2])
+        self._mismatch_since = min(self._mismatch_since, now) if off > VELOCITY_MISMATCH else math.inf
+        if now - self._mismatch_since >= patience and not self.distrusted:
+            self.distrusted = (
+                f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
+                "are its axes the vehicle's?"
+            )
+
+
+def _sum(first: Triple, second: Triple) -> Triple:
+    return first[0] + second[0], first[1] + second[1], first[2] + second[2]
