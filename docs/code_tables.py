@@ -29,8 +29,9 @@ from cfplan.flight.pilot.prearm import LISTEN_WHILE_ARMED
 from cfplan.flight.pilot.process import LANDING_TIMEOUT
 from cfplan.flight.pilot.proposals import LOOKS_UNTIL
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, UNKNOWABLE
-from cfplan.flight.radio.connection import FIRST_ANSWER, WHOLE_CONNECTION
+from cfplan.flight.radio.connection import FIRST_ANSWER
 from cfplan.flight.radio.perishable import KEEPS_FOR
+from cfplan.flight.radio.session import TABLES_WITHIN
 from cfplan.flight.setpoints.stops import DURATION as STOP_DURATION
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.supervisor import Settings
@@ -161,7 +162,7 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
     ),
     "beginning": (
         TimeOut("the first packet back", FIRST_ANSWER, "`nothing answers`", "the pilot"),
-        TimeOut("the vehicle's tables", WHOLE_CONNECTION, "`its tables do not come through`", "the pilot"),
+        TimeOut("the vehicle's tables", TABLES_WITHIN, "`its tables do not come through`", "the pilot"),
         TimeOut("the first good poses", OPEN_WITHIN, "the flight is refused", "the pose feed"),
         TimeOut("other commanders, listened for once the vehicle is armed", LISTEN_WHILE_ARMED,
                 "if one is heard, the vehicle is disarmed", "the pilot"),

@@ -13,9 +13,9 @@ import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.mission import Mission, mission_of
-from cfplan.flight.setpoints.encoding import RATE, EncodedFlight, encode_motion, motion_at
+from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight, encode_motion, motion_at
+from cfplan.flight.setpoints.level_out import BRAKE_LEAD
 from cfplan.flight.setpoints.packets import decode
-from cfplan.flight.setpoints.rate_trade import BRAKE_LEAD
 from cfplan.geometry.path_file import load_path_file
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, rehearse
@@ -219,7 +219,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
 
 def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
     """Return the same flight with accelerations and attitudes of the motion alone, without drag compensation."""
-    times = encoded.times + encoded.lead
+    times = encoded.times + LEAD
     states = trajectory.at(times)
     thrust = states.acceleration + np.array([0.0, 0.0, GRAVITY])
     axis = (thrust / np.linalg.norm(thrust, axis=1)[:, None]).T

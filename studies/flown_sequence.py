@@ -12,19 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.setpoints.byte_check import check_bytes, check_setpoints
 from cfplan.flight.setpoints.commitment import QUANTUM
-from cfplan.flight.setpoints.encoding import (
-    ATTITUDE_QUANTUM,
-    HALF_QUANTUM,
-    LEAD,
-    RATE,
-    RATE_LEAD,
-    THRUST_LEAD,
-    EncodedFlight,
-    check_bytes,
-    check_setpoints,
-)
-from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
+from cfplan.flight.setpoints.packets import ATTITUDE_QUANTUM, HALF_QUANTUM, FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.safety.certificate import certify
@@ -155,9 +146,7 @@ def _byte_faults(committed: Committed, limits: Limits) -> list[str]:
     payloads = committed.payloads[first:before_stop]
     times = np.arange(first, before_stop) / RATE
     since, decoded = committed.flown.since(committed.splice / RATE), decode(payloads)
-    encoded = EncodedFlight(
-        times, payloads, decoded, decoded, LEAD, RATE_LEAD, THRUST_LEAD, gains_under(limits), limits.space
-    )
+    encoded = EncodedFlight(times, payloads, decoded, decoded, gains_under(limits), limits.space)
     check = check_setpoints if committed.stop_from else check_bytes
     try:
         check(encoded, since, limits.plan)

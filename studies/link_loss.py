@@ -8,7 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from cfplan.flight.setpoints.encoding import command_quaternion, motion_at
+from cfplan.flight.setpoints.encoding import LEAD, command_quaternion, motion_at
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
@@ -53,7 +53,7 @@ def measure(case: tuple[Path, float]) -> dict[str, Any]:
     path_file, speed = case
     planned = plan_flight(path_file, limits_for(path_file), FlightOptions(speed_factor=speed))
     encoded = encode_flight(planned)
-    motion = motion_at(planned.plan.trajectory, encoded.times + encoded.lead)
+    motion = motion_at(planned.plan.trajectory, encoded.times + LEAD)
     as_rates = link_loss_at_every_setpoint(with_rates(motion), planned.limits)
     watched, alone = (_lost(planned, watchdog) for watchdog in (True, False))
     return {

@@ -22,7 +22,8 @@ import numpy as np
 
 from cfplan.deadline import Deadline
 from cfplan.errors import CfplanError, NotCertifiedError
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.model_files import find_model

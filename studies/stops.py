@@ -94,7 +94,7 @@ def _stop(timeline: Timeline, duration: float, limits: Limits) -> Braking:
     number, gains, space = _at_full_speed(timeline), gains_under(limits), limits.space
     motion = encode_trajectory(timeline.motion.since(number / RATE), gains=gains, space=space).motion
     payloads = encode_stops(motion, RATE, duration, _NEXT, gains, space)
-    reached = certify_stops(payloads, motion, limits, RATE, _NEXT, gains, space).worst
+    reached = certify_stops(payloads, motion, limits, RATE, rows=_NEXT, gains=gains, space=space).worst
     made, _ = stop_motion(motion, _NEXT, RATE, duration)
     refused, flown = "", math.nan
     try:

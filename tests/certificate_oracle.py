@@ -7,7 +7,8 @@ import numpy as np
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframes import AIRFRAMES
-from cfplan.vehicle.trajectory import Trajectory, state_at
+from cfplan.vehicle.motion import states_at
+from cfplan.vehicle.trajectory import Trajectory, state_of
 
 AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
 LIMITS = PlanLimits(
@@ -29,7 +30,8 @@ def worst_values(trajectory: Trajectory, space: Space, parts: int = 20) -> dict[
         count = parts * max(10, int(np.ceil(duration / 1e-3)))
         s = np.append(np.linspace(left, right, count, endpoint=False), np.nextafter(right, 0))
         interval = np.full(len(s), int(profile.interval(np.array((left + right) / 2))))
-        state = state_at(path, profile, trajectory.airframe, s, time=s, interval=interval)
+        curve = path.derivatives(s)
+        state = state_of(s, s, curve, states_at(trajectory.airframe, curve, profile.table(), s, interval))
         inside = np.minimum(state.position - space.low, np.array(space.high) - state.position)
         for name, value in {
             "speed": np.linalg.norm(state.velocity, axis=1).max(),

@@ -17,6 +17,7 @@ MENTIONED = ("init --mass", "fly --on-board", "doctor --uri", "dataset make --pl
 # The first pattern that a command matches says which test runs it; the files' own tests hold that they do.
 AS_SHOWN = "tests/cli/test_commands_of_the_pages.py::test_a_command_ends_well_as_it_is_shown"
 FLOWN = "tests/cli/test_commands_of_the_pages.py::test_a_flight_lands_as_it_is_shown"
+AGAIN = "tests/cli/test_fly_again.py::test_a_second_flight_goes_as_it_is_shown"
 STEERED = "tests/cli/test_commands_of_the_pages.py::test_waypoints_are_flown_as_it_is_shown"
 COMPLETED = "tests/cli/test_commands_of_the_pages.py::test_completion_is_set_up_as_it_is_shown"
 ROOM = "tests/cli/test_virtual_in_real_time.py::test_a_second_terminal_flies_one_of_two_vehicles_by_its_own_poses"
@@ -30,6 +31,7 @@ RUN_BY = (
     (r"cfplan (virtual|mocap)\b|--uri udp:|cfplan doctor --uri", ROOM),
     (r"python -m cfplan fly …$", AS_SHOWN),
     (r"cfplan fly --waypoints", STEERED),
+    (r"cfplan fly .*--after", AGAIN),
     (r"cfplan fly", FLOWN),
     (r"cfplan (dataset|train|bench|robustness)|python -m studies", MEASURED),
     (r"cfplan (init|plan|check|sim|export|replay|report|identify|doctor)\b", AS_SHOWN),

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from cfplan.air.background import Check, background_checks
 from cfplan.errors import CfplanError, InfeasibleError
+from cfplan.flight.setpoints.byte_check import check_bytes, check_setpoints
 from cfplan.flight.setpoints.commitment import left_of
-from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, check_bytes, check_setpoints, encode_trajectory
+from cfplan.flight.setpoints.encoding import HOLD, RATE, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import encode_certified_stops
@@ -31,7 +32,7 @@ from cfplan.simulation.link_loss import LinkLossMoments, as_believed, foreseen_l
 from cfplan.vehicle.joint import JoinedTrajectory
 
 STOP = round(DURATION * RATE)  # setpoints from the place where a stop begins to where it rests
-BEHIND = STOP + 1 + round(HOLD * RATE)  # setpoints of a beginning behind those that follow the motion
+STOP_AND_HOVER = STOP + 1 + round(HOLD * RATE)  # setpoints of a beginning behind those that follow the motion
 _FORESEEN = 0.05  # m beyond a wall; if link loss is only estimated, less than this is ignored
 
 
@@ -115,7 +116,9 @@ def certify_beginning(onward: Onward, following: int, limits: Limits, *, foresee
         believed = as_believed(starts, limits)
         rehearse_setpoints(beginning.payloads, limits.airframe, limits.flight, snapshot=believed).require_passed()
 
-    stops, lost = _certified(beginning.encoded, beginning.payloads, limits, starts, check, beginning.motion, foreseen)
+    stops, lost = _certified(
+        beginning.encoded, beginning.payloads, limits, starts, check, motion=beginning.motion, foreseen=foreseen
+    )
     return beginning.certified(stops, lost.snapshots)
 
 
@@ -133,14 +136,14 @@ class _Beginning(NamedTuple):
         """Return the beginning of an encoded flight, which must reach as far as the stops from it do."""
         motion, gains, space = _motion_rows(encoded.motion, slice(following + STOP)), encoded.gains, encoded.space
         stop = encode_stops(motion, RATE, rows=np.array([following]), gains=gains, space=space)[0]
-        hovering = np.repeat(stop[-1:], BEHIND - len(stop), axis=0)
+        hovering = np.repeat(stop[-1:], STOP_AND_HOVER - len(stop), axis=0)
         payloads = np.concatenate([encoded.payloads[:following], stop, hovering])
         begun = _rows(encoded, slice(following + 1))
         return cls(payloads, begun, motion, stop, rest_behind(motion, following, RATE))
 
     def certified(self, stops: NDArray, snapshots: NDArray) -> CertifiedFlight:
         """Return the certified flight; `stops`, (K, M, 29), are those from the setpoints before the stop."""
-        behind = left_of(self.stop, BEHIND - 1)
+        behind = left_of(self.stop, STOP_AND_HOVER - 1)
         following = len(stops) - 1
         return CertifiedFlight(self.payloads, np.concatenate([stops, behind]), snapshots, following, self.rest)
 
@@ -163,6 +166,7 @@ def _certified(
     limits: Limits,
     starts: NDArray | None,
     check: Callable[[], None],
+    *,  # for a beginning only
     motion: FullStateSetpoints | None = None,
     foreseen: Sequence[Check] = (),
 ) -> tuple[NDArray, LinkLossMoments]:

@@ -31,9 +31,9 @@ PART = 4.0  # s of part per s of planning look-ahead, if that is longer
 NEAR = 0.5  # s before the next part must be planned, at which planning it begins
 QUIET = 1.0  # s without a request, after which parts are planned far ahead: no request is likely to replace them
 FARTHEST = 30.0  # s, how far ahead parts are then committed at most
-ON_THE_WAY = 0.001  # s, least time in which a proposal reaches the pilot
-LEARNED_FROM, IN_TIME = 15, 0.8  # recent jobs of a kind; the quantile of their durations that predicts the next
-TRIES, LATER = 3, 2.0  # attempts per request if proposals come late; factor on the look-ahead of the next
+TRANSFER_TIME = 0.001  # s, least time in which a proposal reaches the pilot
+RECENT_JOBS, LATENCY_QUANTILE = 15, 0.8  # recent jobs of a kind; the quantile of their durations that predicts the next
+TRIES, RETRY_BACKOFF = 3, 2.0  # attempts per request if proposals come late; factor on the look-ahead of the next
 
 
 # Events.
@@ -157,7 +157,7 @@ class CoreState:
 
     def ahead(self, kind: str) -> float:
         """Return how far ahead to plan, s, so that most jobs of a kind are in time."""
-        return float(np.quantile(self.took[kind], IN_TIME)) + ON_THE_WAY
+        return float(np.quantile(self.took[kind], LATENCY_QUANTILE)) + TRANSFER_TIME
 
     def first(self, now: float, ahead: float) -> int:
         """Return the earliest splice of a plan that is proposed `ahead`, s, from now."""
@@ -165,7 +165,7 @@ class CoreState:
 
     def learned(self, kind: str, took: float) -> "CoreState":
         """Return the state with one more recorded job duration, s."""
-        return replace(self, took=self.took | {kind: (*self.took[kind], took)[-LEARNED_FROM:]})
+        return replace(self, took=self.took | {kind: (*self.took[kind], took)[-RECENT_JOBS:]})
 
     @property
     def wakes(self) -> float | None:
@@ -220,7 +220,7 @@ def _next(state: CoreState, now: float) -> tuple[CoreState, list[Effect]]:
     if state.waiting is not None and math.isnan(state.begun):
         number = state.waiting[0].number
         return replace(state, waiting=None), [Tell(PathAnswer(number, PathVerdict.REFUSED, NOT_FLOWN))]
-    if _wants_more(state, now) and (state.waiting is None or _presses(state, now)):
+    if _wants_more(state, now) and (state.waiting is None or _next_part_is_urgent(state, now)):
         return _begin(state, None, now, now, state.ahead("part"))
     if state.waiting is not None:
         request, received = state.waiting
@@ -247,7 +247,7 @@ def _wants_more(state: CoreState, now: float) -> bool:
     return timeline.part_ends is None or timeline.part_ends < state.first(now, state.ahead("part") + within)
 
 
-def _presses(state: CoreState, now: float) -> bool:
+def _next_part_is_urgent(state: CoreState, now: float) -> bool:
     """Return whether the next part must be planned before a waiting request, so as to be in time."""
     ends = state.timeline.part_ends
     return ends is not None and ends < state.first(now, state.ahead("plan") + 2.0 * state.ahead("part"))
@@ -272,7 +272,7 @@ def _made(
             answer = PathAnswer(job.request.number, PathVerdict.ACCEPTED, reason, ends=result.ends)
             return state, [Tell(replace(answer, seconds=now - job.received))]
     sent = Sent(job, result, now) if result.stop is None else Sent(job, result.stop, now, behind=result)
-    if state.first(now, ON_THE_WAY) > sent.made.proposal.splice:
+    if state.first(now, TRANSFER_TIME) > sent.made.proposal.splice:
         return _late(state, job, Fault.LATE.value, now)
     return replace(state, sent=sent), [Propose(sent.made.proposal)]
 
@@ -316,7 +316,7 @@ def _late(state: CoreState, job: Job, reason: str, now: float) -> tuple[CoreStat
         return state, []
     if job.tries == TRIES:
         return state, [Tell(PathAnswer(job.request.number, PathVerdict.LATE, reason, seconds=now - job.received))]
-    ahead = LATER * max(now - job.begun, job.ahead)
+    ahead = RETRY_BACKOFF * max(now - job.begun, job.ahead)
     return _begin(state, job.request, job.received, now, ahead, job.tries + 1)
 
 

@@ -1,7 +1,9 @@
 """Replan from the current timeline: turn a request into a certified proposal for the pilot.
 
-The motion changes at the first joint for which the proposal can be in time. If no path leads on from there, or if link
-loss or a gap would end badly, later joints and lower speeds are tried, and finally a plan from rest behind a stop.
+The motion changes at the first joint for which the proposal can be in time: the setpoints up to there stay as they are
+committed, and a plan that begins in the state at the joint is encoded and certified behind it. If no path leads on from
+there, or if link loss or a gap would end badly, later joints and lower speeds are tried, and finally a plan from rest
+behind a stop.
 """
 
 import itertools
@@ -23,10 +25,10 @@ from cfplan.geometry.min_snap import MIN_SPACING, spaced
 from cfplan.planning.continuation import Continuation, NoWayError, check_waypoints, continue_plan, plan_from_rest
 from cfplan.safety.limits import Limits
 
-SLOWER = (1.2, 0.7)  # m/s, tried in order if the flight would end badly at full speed
+LOWER_SPEEDS = (1.2, 0.7)  # m/s, tried in order if the flight would end badly at full speed
 JOINT_DELAYS = (0, 5, 15, 35)  # setpoints by which the joint is delayed, tried in order
-SOON = 3  # setpoints by which a plan that slows down begins later than the splice: planning the next part took time
-PACE = 0.75  # factor by which a request lowers the speed; a request to fly faster undoes it
+SLOWDOWN_MARGIN = 3  # setpoints after the splice at which a slower plan begins, as planning the next part took time
+SPEED_STEP = 0.75  # factor by which a request lowers the speed; a request to fly faster undoes it
 
 
 class PlanOptions(TypedDict):
@@ -67,7 +69,7 @@ def answer_request(
             return halt(timeline, splice, limits)
         case Wish.SLOWER | Wish.FASTER:
             now = min(timeline.speed, limits.plan.speed)
-            slowed = timeline.slowed_to(now * PACE if request.wish is Wish.SLOWER else now / PACE)
+            slowed = timeline.slowed_to(now * SPEED_STEP if request.wish is Wish.SLOWER else now / SPEED_STEP)
             nothing_ahead = timeline.stopping and not len(timeline.left)
             if nothing_ahead or joint_of(splice) >= timeline.ends:
                 return slowed
@@ -89,7 +91,7 @@ def replan(
     splice: int,
     waypoints: ArrayLike,
     limits: Limits,
-    *,
+    *,  # options, each of which is used without the others
     keep: bool = False,
     yaw_angle: float = 0.0,
     part: int | None = None,
@@ -153,7 +155,7 @@ def next_part(timeline: Timeline, splice: int, limits: Limits, part: int) -> Rep
             proposal = propose(timeline.commitment, ahead, made.payloads, made.stops, made.ending, goes_on=True)
             return Replanned(proposal, timeline.with_certified(ahead, made), None, joint_of(ahead))
         with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
-            return _search(timeline, min(splice + SOON, ahead), rest_of_it, limits, slower=True)
+            return _search(timeline, min(splice + SLOWDOWN_MARGIN, ahead), rest_of_it, limits, slower=True)
         splice = ahead
     return _search(timeline, splice, rest_of_it, limits) if timeline.unfinished else timeline
 
@@ -184,7 +186,7 @@ def _search(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits, *
     """Return the first certified plan among later joints and lower speeds; with `slower`, at lower speeds alone."""
     splice, _ = timeline.for_plans_from(splice, limits).leaving(splice, keep=spec.keep)
     fastest = min(timeline.speed, limits.plan.speed)
-    speeds = [*([] if slower else [fastest]), *(speed for speed in SLOWER if speed < fastest)]
+    speeds = [*([] if slower else [fastest]), *(speed for speed in LOWER_SPEEDS if speed < fastest)]
     refused: InfeasibleError | None = None
     for speed in speeds:
         for leave_room, delay in itertools.product((True, False), JOINT_DELAYS):

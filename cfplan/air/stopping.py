@@ -26,10 +26,10 @@ STOPS = (0.46, 0.48, 0.5, 0.52, 0.54, 0.55, 0.56, 0.58, 0.6, 0.65, 0.7, 0.8, 1.0
 """s, durations of stops, tried in order. From 2 m/s on a straight line a stop of 0.54 s brakes at 6.9 m/s², a tilt of
 35°; the deceleration differs if the vehicle turns or slows down already. A stop of constant deceleration would be
 planned to end 0.1 m sooner, but because motors lag the vehicle would overshoot it by as much."""
-STRAYS = 0.025  # m, by which a shortened stop may increase the deviation in its dry run
+DEVIATION_MARGIN = 0.025  # m, by which a shortened stop may increase the deviation in its dry run
 """Above that, motors saturate, and a little noise increases the deviation: two stops that deviated by 2.8 and 4.0 cm in
 the dry run deviated by 8.9 and 6.1 cm in flight."""
-STRAYS_SLUGGISH = 0.16  # m, likewise with the longest motor lag
+DEVIATION_MARGIN_SLUGGISH = 0.16  # m, likewise with the longest motor lag
 """This lag shows saturation more clearly. Of 440 stops the two that deviated most in flight, by 8.3 and 4.6 cm, did so
 by 0.24 and 0.22 m in this dry run; the 437 that deviated by less than 0.16 m in it, by 4.0 cm at most in flight."""
 
@@ -82,7 +82,7 @@ def _stop_along(
     motion, gains, space = encoded.motion, encoded.gains, encoded.space
     first, second = np.array([0]), np.array([1])
     stop = encode_stops(motion, RATE, duration, second, gains, space)
-    certify_stops(stop, motion, limits, RATE, second, gains, space).require(limits)
+    certify_stops(stop, motion, limits, RATE, rows=second, gains=gains, space=space).require(limits)
     rows, rest = stop[0], stop[0, -1:]
     hovering = np.repeat(rest, round(HOLD * RATE), axis=0)
     payloads = np.concatenate([encoded.payloads[:1], rows, hovering])
@@ -116,10 +116,10 @@ def _rehearse_stop(payloads: NDArray, duration: float, limits: Limits, starts: N
     run.require_passed()
     if duration >= DURATION:
         return
-    _require_near(run, math.dist(believed[:3], begin) + STRAYS, duration)
+    _require_near(run, math.dist(believed[:3], begin) + DEVIATION_MARGIN, duration)
     airframe, sluggish = as_most_sluggish(starts, limits)
     run = rehearse_setpoints(payloads, airframe, limits.flight, snapshot=sluggish)
-    _require_near(run, math.dist(sluggish[:3], begin) + STRAYS_SLUGGISH, duration)
+    _require_near(run, math.dist(sluggish[:3], begin) + DEVIATION_MARGIN_SLUGGISH, duration)
 
 
 def _require_near(run: Rehearsal, most: float, duration: float) -> None:

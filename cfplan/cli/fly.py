@@ -1,6 +1,8 @@
 """`cfplan fly`: plan, certify, rehearse, fly, record."""
 
 import shlex
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from cfplan.cli.recorded_flight import Prepared, RecordedFlight
+    from cfplan.preparation.plan_flight import FlightOptions
+    from cfplan.safety.limits import Limits
 
 BUSY = 0.02  # s; setpoints are later than this only if the computer is busy
 
@@ -27,6 +31,7 @@ Examples:
   cfplan fly flights/figure8.yaml --speed 0.3
   cfplan fly flights/figure8.yaml --live --mavlink udp:127.0.0.1:14550
   cfplan fly flights/figure8.yaml --on-board
+  cfplan fly flights/figure8.yaml --after records/<flight>
   printf '1 0 1\\n0 1 1.2\\n' | cfplan fly --waypoints -
 
 Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts.""",
@@ -44,6 +49,13 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     "--on-board",
     is_flag=True,
     help="Upload the flight as polynomials for the vehicle's own commander; only poses are streamed.",
+)
+@click.option(
+    "--after",
+    multiple=True,
+    metavar="RECORD",
+    type=click.Path(path_type=Path),
+    help="Correct setpoints by what repeated in earlier flights of this plan; once per record, in order.",
 )
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
@@ -70,6 +82,7 @@ def fly(
     path_or_plan: Path | None,
     lines: str | None,
     on_board: bool,
+    after: tuple[Path, ...],
     safety_file: Path | None,
     uri: str,
     mocap_uri: str | None,
@@ -89,7 +102,7 @@ def fly(
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
-        place = _source_of_waypoints(path_or_plan, lines, on_board)
+        place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
@@ -97,7 +110,7 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        prepare = _preparation(on_board)
+        prepare = _preparation(on_board, after, planning, uri)
         prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             click.echo("not flown", err=True)
@@ -107,19 +120,58 @@ def fly(
     return int(flown.outcome.exit_code)
 
 
-def _preparation(on_board: bool) -> "Callable[..., Prepared]":
-    """Return the function that prepares a streamed flight, or one on board."""
-    if on_board:
-        from cfplan.preparation.on_board_flight import prepare_on_board_flight
+def _preparation(
+    on_board: bool, after: tuple[Path, ...], planning: dict[str, Any], uri: str
+) -> "Callable[..., Prepared]":  # fmt: skip
+    """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others.
 
-        return prepare_on_board_flight
+    Raises InputError where an option asks for a new plan after others.
+    """
+    from cfplan.preparation.on_board_flight import prepare_on_board_flight
     from cfplan.preparation.prepare_flight import prepare_flight
 
-    return prepare_flight
+    prepare: Callable[..., Prepared] = prepare_on_board_flight if on_board else prepare_flight
+    if not after:
+        return prepare
+    _require_no_new_plan(planning)
+    return partial(_prepare_again, prepare, after, on_board, uri)
 
 
-def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool) -> str:
+def _require_no_new_plan(planning: dict[str, Any]) -> None:
+    """Raise InputError where an option asks for a plan other than that of the records of --after."""
+    chosen = [f"--{name}" for name in ("nodes", "model") if planning[name] is not None]
+    chosen += ["--speed"] if planning["speed_factor"] is not None else []
+    chosen += ["--planner"] if planning["planner"] != "auto" else []
+    if chosen:
+        raise InputError(
+            f"{chosen[0]} asks for a new plan, and --after flies that of the records", where="--after",
+            hint="leave one of them out",
+        )  # fmt: skip
+
+
+def _prepare_again(
+    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], on_board: bool, uri: str,
+    path_or_plan: Path, limits: "Limits", flight_options: "FlightOptions", steps: Steps,
+) -> "Prepared":  # fmt: skip
+    """Prepare the plan of earlier flights, corrected by what repeated in them."""
+    from cfplan.identification.earlier_flights import earlier_flights, learn_correction
+
+    with steps.step("records") as results:
+        earlier = earlier_flights(after, path_or_plan, limits, on_board=on_board)
+        learned = learn_correction(earlier.flights)
+        results.append(learned.describe())
+        if earlier.uri != uri:
+            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle strays otherwise")
+    prepared = prepare(earlier.plan_file, limits, replace(flight_options, correction=learned.correction), steps)
+    return replace(prepared, planned=replace(prepared.planned, name=earlier.name))
+
+
+def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool, after: tuple[Path, ...]) -> str:
     """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
+    if after and lines is not None:
+        raise InputError(
+            "waypoints that come in the air make a new plan", where="--after", hint="name the path of the records"
+        )
     if on_board and lines is not None:
         raise InputError(
             "waypoints that come in the air are streamed", where="--on-board", hint="name a path, or leave it out"

@@ -19,9 +19,9 @@ from cfplan.identification.advice import suggests_identification
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.on_board_flight import PreparedOnBoard
 from cfplan.preparation.prepare_flight import PreparedFlight
-from cfplan.recording.header import header_of_plan
+from cfplan.recording.header import FLOWN, header_of_plan
 from cfplan.recording.reader import read_record
-from cfplan.recording.record import Record
+from cfplan.recording.record import PLAN_FILE, UNCORRECTED_FILE, Record
 from cfplan.recording.summary import summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 from cfplan.steering.starting_vehicle import StartingVehicle
@@ -81,10 +81,15 @@ def _fly_into(
 ) -> tuple[FlightOutcome, list[tuple[str, str]]]:
     """Fly, and return the outcome and the failures of record or watchers: (which, reason)."""
     name, uri = prepared.planned.name, vehicle.uri
-    save_plan(prepared.plan, folder / "plan.parquet", {"name": name, "path file": str(source)})
-    header = header_of_plan(prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero())
+    uncorrected, provenance = prepared.planned.uncorrected, {"name": name, "path file": str(source)}
+    save_plan(prepared.plan, folder / PLAN_FILE, provenance)
+    if uncorrected is not None:
+        save_plan(uncorrected, folder / UNCORRECTED_FILE, provenance)
+    header = header_of_plan(
+        prepared.plan, name=name, uri=uri, source=source, wall_time_at_zero=wall_time_at_zero(), uncorrected=uncorrected
+    )
     if prepared.mission.on_board is not None:
-        header = replace(header, provenance={**header.provenance, "flown": "on board"})
+        header = replace(header, provenance={**header.provenance, FLOWN: "on board"})
     with (
         RecordWriter(folder, header) as writer,
         watchers(header, folder, watched) as watching,

@@ -16,6 +16,7 @@ from typing import Protocol, TypeVar
 BEGIN = 1000.0  # s, where a stepped clock starts
 _LONGEST_DEAFNESS = 0.1  # s until a repeated act that waits for a socket notices that it was stopped
 _SHORTEST_DELAY = 0.001  # s between repeated acts, on a stepped clock: time goes on between them
+_STEP = 0.001  # s between looks at an event that the world may set, on a stepped clock
 _LOOK_PERIOD = 0.01  # s between looks at the sockets that wake repeated acts, on a stepped clock
 
 
@@ -149,7 +150,7 @@ class SteppedClock:
     def wait(self, event: threading.Event, patience: float) -> bool:
         end = self._now + patience
         while not event.is_set() and self._now < end:
-            self.sleep(min([end, *(time for time, _ in self._events[:1])]) - self._now)
+            self.sleep(min([end, self._now + _STEP, *(time for time, _ in self._events[:1])]) - self._now)
         return event.is_set()
 
     def readable(self, sources: Sequence[AnySource], patience: float) -> list[AnySource]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.geometry.min_snap import ENERGY, HERMITE, REST, derivatives_at, solve_adjoint
+from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 
 _POWERS = np.tile(np.arange(4), 2)  # of a segment's time, by which the values at its ends scale
@@ -94,8 +95,7 @@ def _sum_over_places(
     by_ends, by_left = np.zeros((count, 8, 3)), np.zeros((count, 3))
     moved, scaled = np.zeros(count), np.zeros(count)
     ends, basis = np.zeros((8, 3)), np.zeros((6, 8))
-    for place in range(len(s)):
-        piece = min(max(np.searchsorted(breaks, s[place], side="right") - 1, 0), count - 1)
+    for place, piece in enumerate(intervals_of(breaks, s)):
         time = times[piece]
         u = (s[place] - breaks[piece]) / time
         for order in range(6):

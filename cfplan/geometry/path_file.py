@@ -21,6 +21,7 @@ waypoints:
   - {gate: [2, 1, 1], yaw_deg: 90, width: 0.6, height: 0.6}
 """
 
+import hashlib
 import math
 import pathlib
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from cfplan.errors import InputError
-from cfplan.files.text import read_named_table
+from cfplan.files.text import read_named_table, read_text
 from cfplan.files.yaml_with_places import HINT, Places, read_yaml_with_places
 from cfplan.geometry.min_snap import (
     MIN_DENSE_SPACING,
@@ -175,6 +176,15 @@ class _Content(BaseModel):
     laps: int = Field(default=1, ge=1, le=1000)
     speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
     place: _Place = _Place()
+
+
+def fingerprint(file: pathlib.Path) -> str:
+    """Return the SHA-256 of a path file's text and of its waypoints, which may be in another file.
+
+    Raises InputError as load_path_file() does.
+    """
+    waypoints = np.round(load_path_file(file).waypoints, 6) + 0.0  # no negative zeros
+    return hashlib.sha256(read_text(file).encode() + waypoints.tobytes()).hexdigest()
 
 
 def load_path_file(file: pathlib.Path | str) -> PathFile:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.files.text import read_table
 from cfplan.geometry.min_snap import smooth_through
-from cfplan.geometry.polynomials import end_values, largest_values
+from cfplan.geometry.polynomials import derivatives_on, end_values, intervals_of, largest_values
 from cfplan.geometry.rest import close_joints, with_rest_ends
 from cfplan.geometry.timed_samples import distances
 
@@ -62,12 +62,11 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Any, ...]:
 
 def _sampled(durations: NDArray, table: NDArray) -> NDArray:
     """Return points, (N, 3) m, on pieces (M, D, 3), _SPACING or a little less apart."""
-    starts = np.cumsum(durations) - durations
+    breaks = np.append(0.0, np.cumsum(durations))
+    starts, table = breaks[:-1], np.ascontiguousarray(table)
 
     def at(times: NDArray) -> NDArray:
-        piece = np.maximum(np.searchsorted(starts, times, side="right") - 1, 0)
-        powers = (times - starts[piece])[:, None] ** np.arange(table.shape[1])
-        return np.asarray(np.einsum("nd,nda->na", powers, table[piece]))
+        return np.asarray(derivatives_on(starts, table, times, intervals_of(breaks, times))[0].T)
 
     times = np.append((starts + np.linspace(0.0, durations, _TIMES, endpoint=False)).T.ravel(), durations.sum())
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at(times), axis=0), axis=1)))

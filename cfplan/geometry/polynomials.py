@@ -4,9 +4,80 @@ from functools import lru_cache
 from math import comb, factorial
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.machine_code import njit
+
+ORDERS = 5  # a value and four derivatives
 _SAMPLES = 17  # along a piece, to find its largest derivatives
+_LANES = 64  # points taken together
+_FACTORIALS = (1.0, 1.0, 2.0, 6.0, 24.0)
+_Derivatives = tuple[float, float, float, float, float]
+
+
+@njit
+def intervals_of(edges: NDArray, values: NDArray) -> NDArray:
+    """Return the interval of ascending edges, (M+1,), in which each value, (N,), lies; fast where they are in order.
+
+    An edge belongs to the interval on its right; the first and the last interval hold what lies beyond.
+    """
+    found, k = np.empty(len(values), np.int64), 0
+    for n in range(len(values)):
+        if not edges[k] <= values[n] < edges[k + 1]:
+            k = np.searchsorted(edges[1:-1], values[n], side="right")
+        found[n] = k
+    return found
+
+
+@njit(fastmath={"contract"}, nogil=True)
+def derivatives_on(origins: NDArray, table: NDArray, x: NDArray, piece: NDArray) -> NDArray:
+    """Return polynomials, (M, D, A), and four derivatives, (5, A, N), at x, (N,), by that of a piece for each, (N,).
+
+    Piece i is in powers of x - origins[i]. Consecutive points of one piece are taken together, up to _LANES of them, in
+    rows of an array whose size the compiler knows: so it works on several points with one instruction.
+    """
+    axes, begin = table.shape[2], 0
+    out, rows = np.empty((ORDERS, axes, len(x))), np.empty((ORDERS + 1, _LANES))
+    while begin < len(x):
+        k, count = piece[begin], 1
+        while count < _LANES and begin + count < len(x) and piece[begin + count] == k:
+            count += 1
+        for n in range(count):
+            rows[ORDERS, n] = x[begin + n] - origins[k]
+        for axis in range(axes):
+            _horner(rows, table[k, :, axis], min(count, _LANES))
+            for order in range(ORDERS):
+                to = out[order, axis, begin : begin + count]
+                for n in range(len(to)):
+                    to[n] = _FACTORIALS[order] * rows[order, n]
+        begin += count
+    return out
+
+
+@register_jitable(forceinline=True, fastmath={"contract"})
+def _horner(rows: NDArray, coefficients: NDArray, count: int) -> None:
+    """Write a polynomial and four derivatives over the factorials of their orders; x are in the last of the rows."""
+    for order in range(ORDERS):
+        for n in range(count):
+            rows[order, n] = 0.0
+    for k in range((len(coefficients) - 1) // 4 * 4, -1, -4):  # four coefficients at a time, which spares memory
+        a, b = coefficients[k], _or_zero(coefficients, k + 1)
+        c, d = _or_zero(coefficients, k + 2), _or_zero(coefficients, k + 3)
+        for n in range(count):
+            x, p = rows[ORDERS, n], (rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n])
+            p = _step(x, a, _step(x, b, _step(x, c, _step(x, d, p))))
+            rows[0, n], rows[1, n], rows[2, n], rows[3, n], rows[4, n] = p
+
+
+@register_jitable(forceinline=True, fastmath={"contract"})
+def _step(x: float, coefficient: float, p: _Derivatives) -> _Derivatives:
+    return x * p[0] + coefficient, x * p[1] + p[0], x * p[2] + p[1], x * p[3] + p[2], x * p[4] + p[3]
+
+
+@register_jitable(forceinline=True)
+def _or_zero(coefficients: NDArray, power: int) -> float:
+    return coefficients[power] if power < len(coefficients) else 0.0
 
 
 def shifted(table: NDArray, offset: NDArray) -> NDArray:

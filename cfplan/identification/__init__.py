@@ -3,6 +3,7 @@
 __all__ = [
     "advice",
     "airframe_yaml",
+    "earlier_flights",
     "flight_log",
     "gains_file",
     "identify",

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import factorial
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.signal import savgol_filter
 
 from cfplan.errors import InputError
 from cfplan.geometry.polynomial_csv import read_polynomial_rows
+from cfplan.geometry.polynomials import derivatives_on, intervals_of
 from cfplan.simulation.engine.lee import REFERENCE_SIZE
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -55,21 +55,15 @@ def reference_of_polynomials(file: Path, time_scale: float = 1.0) -> ReferenceMo
         hint = "0.5 flies the polynomials in half their time"
         raise InputError(f"the time scale must be positive, not {time_scale:g}", where=str(file), hint=hint)
     durations, table = read_polynomial_rows(file)
-    ends = np.cumsum(durations)
-    time = np.arange(0.0, ends[-1] * time_scale + _STEP, _STEP)
-    inside = np.minimum(time / time_scale, ends[-1])
-    piece = np.minimum(np.searchsorted(ends, inside, side="right"), len(durations) - 1)
-    along = inside - (ends - durations)[piece]
-    powers = np.arange(table.shape[2])
+    breaks = np.append(0.0, np.cumsum(durations))
+    time = np.arange(0.0, breaks[-1] * time_scale + _STEP, _STEP)
+    inside = np.minimum(time / time_scale, breaks[-1])
+    table, piece = np.ascontiguousarray(table.swapaxes(1, 2)), intervals_of(breaks, inside)
+    values = derivatives_on(breaks[:-1], table, inside, piece)
     rows = np.zeros((len(time), REFERENCE_SIZE))
     for order in range(4):
-        factors = np.array([factorial(k) / factorial(k - order) if k >= order else 0.0 for k in powers])
-        values = np.einsum(
-            "nk,nak->na", factors * along[:, None] ** np.maximum(powers - order, 0), table[piece]
-        ) / time_scale**order  # fmt: skip
-        rows[:, 3 * order : 3 * order + 3] = values[:, :3]
-        if order < 2:
-            rows[:, YAW + order] = values[:, 3]
+        rows[:, 3 * order : 3 * order + 3] = values[order, :3].T / time_scale**order
+    rows[:, YAW], rows[:, YAW + 1] = values[0, 3], values[1, 3] / time_scale
     return ReferenceMotion(file.name, time, rows)
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from cfplan.geometry.path import Path, horner_step
+from cfplan.geometry.path import Path, curve_at
 from cfplan.machine_code import njit
 from cfplan.safety.feasibility import LEAST_SPARE, spare_thrust, spare_turning
 from cfplan.safety.limits import PlanLimits
@@ -156,20 +156,12 @@ def fill_node_features(
     Coefficients are in units of length, and `turns`, (count, 2), are ψ'Δs and ψ''Δs², zero where yaw is to be chosen.
     Nodes beyond the path's end get the features of its end.
     """
-    pieces, powers = coefficients.shape[0], coefficients.shape[1]
-    piece = 0
+    curve = curve_at(breaks, coefficients, first + step * np.arange(len(out)))
     g = np.empty((5, 3))
     for n in range(len(out)):
-        s = min(max(first + n * step, 0.0), breaks[pieces])
-        while piece < pieces - 1 and s >= breaks[piece + 1]:
-            piece += 1
-        x = s - (breaks[pieces] if piece == pieces - 1 else breaks[piece])
-        for axis in range(3):
-            p = (0.0, 0.0, 0.0, 0.0, 0.0)
-            for k in range(powers - 1, -1, -1):
-                p = horner_step(x, coefficients[piece, k, axis], p)
-            g[0, axis], g[1, axis], g[2, axis] = p[0], p[1] * step, 2.0 * p[2] * step**2
-            g[3, axis], g[4, axis] = 6.0 * p[3] * step**3, 24.0 * p[4] * step**4
+        for order in range(5):
+            for axis in range(3):
+                g[order, axis] = curve[order, axis, n] * step**order
         row = out[n]
         for order in range(4):
             for axis in range(3):

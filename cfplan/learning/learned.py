@@ -43,7 +43,6 @@ from cfplan.vehicle.yaw_spline import YawSpline
 
 LEAST_NODES = 10
 SPACING = 0.2  # m between the nodes that the network is asked for: about what it was trained on
-BLEND_INTERVALS = 3.0  # over which the profile blends into a state given for the end
 
 
 class ProposedProfile(NamedTuple):
@@ -60,7 +59,6 @@ class Question(NamedTuple):
     known: ScaledLimits
     nodes: int  # intervals, at least the network's window
     start: BoundaryState | None = None
-    end: BoundaryState | None = None
     track: YawSpline | None = None  # None: yaw is the network's to choose
     yaw_angle: float = 0.0  # rad, from which on it may begin then, see PlanningTask
 
@@ -123,21 +121,21 @@ def _sound(coefficients: NDArray, yaw: NDArray) -> bool:
 
 def propose(task: PlanningTask, model: Model) -> tuple[NDArray, YawSpline]:
     """Return the (N+3,) coefficients of h that a model proposes, not finite where it fails, and yaw."""
-    path, nodes, start, end = task.path, task.nodes, task.start, task.end
+    path, nodes, start = task.path, task.nodes, task.start
     asked = _asked(path, nodes, model.window)
     tracks = [
-        None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start, end)
+        None if task.yaw is YawMode.FREE else YawSpline.along(path, count, task.yaw, task.yaw_angle, start)
         for count in dict.fromkeys((asked, nodes))
     ]
     known = scaled_limits(task.airframe, task.limits)
-    question = Question(path, known, asked, start, end, tracks[0], task.yaw_angle)
+    question = Question(path, known, asked, start, tracks[0], task.yaw_angle)
     ((coefficients, turned),) = predict([question], model.network, model.window)
     yaw = tracks[-1]
     if yaw is None:
         places = np.linspace(0.0, asked, nodes + 1)
-        yaw = YawSpline.smoothed(np.interp(places, np.arange(asked + 1), turned), path.end / nodes, start, end)
+        yaw = YawSpline.smoothed(np.interp(places, np.arange(asked + 1), turned), path.end / nodes, start)
     if asked < nodes and np.isfinite(coefficients).all():
-        coefficients = _laid_over(coefficients, nodes, path, start, end)
+        coefficients = _laid_over(coefficients, nodes, path, start)
     return coefficients, yaw
 
 
@@ -153,19 +151,18 @@ def _asked(path: Path, nodes: int, window: int) -> int:
     return min(nodes, max(window, math.ceil(path.length / SPACING), len(path.breaks) - 1))
 
 
-def _laid_over(
-    coefficients: NDArray, nodes: int, path: Path, start: BoundaryState | None, end: BoundaryState | None
-) -> NDArray:
+def _laid_over(coefficients: NDArray, nodes: int, path: Path, start: BoundaryState | None) -> NDArray:
     """Return the (N+3,) coefficients of nearly the same h over more intervals; ends are kept as they are."""
     step = path.end / nodes
     h, dh, ddh = spline_at(coefficients, path.end, nodes)
     fine = coefficients_of(h, dh, ddh, step)
     fine = np.maximum(fine, LEAST_SHARE * coefficients.min())
-    for there, state, s in ((fine, start, 0.0), (fine[::-1], end, path.end)):
-        if state is not None:
-            there[:3] = start_coefficients(state, step)[:: 1 if s == 0.0 else -1]
-        elif rests(path, s):
-            there[:4] = there[1]
+    if start is not None:
+        fine[:3] = start_coefficients(start, step)
+    elif rests(path, 0.0):
+        fine[:4] = fine[1]
+    if rests(path, path.end):
+        fine[-4:] = fine[-2]
     return fine
 
 
@@ -181,12 +178,12 @@ def predict(questions: list[Question], network: Network, window: int) -> list[Pr
 
 
 def _windows(question: Question, window: int) -> _Windows:
-    path, known, nodes, start, end, track, yaw_angle = question
+    path, known, nodes, start, track, yaw_angle = question
     step = path.end / nodes
     table = node_features(path, nodes, known, track)
     starts, counts = windows_over(nodes, window)
     inputs = np.empty((len(starts), window + 1, INPUTS), np.float32)
-    rest_start, rest_end = start is None and rests(path, 0.0), end is None and rests(path, path.end)
+    rest_start, rest_end = start is None and rests(path, 0.0), rests(path, path.end)
     first = (0.0, 0.0, 0.0)
     if start is not None:
         first = start_features(*(each + math.log(known.time) for each in start_logs(start, step)))
@@ -203,7 +200,7 @@ def _windows(question: Question, window: int) -> _Windows:
 
 
 def _proposal(question: Question, asked: _Windows, answers: NDArray) -> ProposedProfile:
-    path, known, nodes, start, end, track, yaw_angle = question
+    path, known, nodes, start, track, yaw_angle = question
     step, starts, counts = path.end / nodes, asked.starts, asked.shares
     rates = overlapped(starts, counts * answers[..., 0]) + asked.reference
     rest_start, rest_end = asked.rests
@@ -215,8 +212,6 @@ def _proposal(question: Question, asked: _Windows, answers: NDArray) -> Proposed
         coefficients = np.exp(2.0 * (logs + math.log(step / known.time)))
     if start is not None:
         coefficients[:3] = start_coefficients(start, step)
-    if end is not None:
-        _blend_to(coefficients, end, step)
     if track is not None:
         return ProposedProfile(coefficients, track.yaw)
     turned = np.arctan2(answers[..., 2], answers[..., 1])
@@ -226,12 +221,3 @@ def _proposal(question: Question, asked: _Windows, answers: NDArray) -> Proposed
     # In the middle of where it may begin: at a bound, refining would end at another optimum than the expert.
     first = start.yaw if start else yaw_angle + FREE_START / 2
     return ProposedProfile(coefficients, first + total - total[0])
-
-
-def _blend_to(coefficients: NDArray, end: BoundaryState, step: float) -> None:
-    """Bend the last coefficients to the given end state."""
-    last = np.array(start_coefficients(end, step))
-    backwards = coefficients[::-1]
-    share = max(last[0], LEAST_SHARE * end.h) / backwards[2]
-    backwards[3:] *= share ** np.exp(-np.arange(1, len(coefficients) - 2) / BLEND_INTERVALS)
-    coefficients[-3:] = last

@@ -23,7 +23,7 @@ FREE_START = math.pi / 2  # rad, from the angle given on, within which yaw begin
 
 @dataclass(frozen=True, slots=True)
 class PlanningTask:
-    """A path to be flown as fast as the limits allow, from one boundary state to another.
+    """A path to be flown as fast as the limits allow, from a boundary state or from rest.
 
     Raises InputError where a number is not finite. What the limits exclude is no error but an answer: see `refusal`.
     """
@@ -35,7 +35,6 @@ class PlanningTask:
     yaw: YawMode = YawMode.FIXED
     yaw_angle: float = 0.0  # rad: held where yaw is FIXED; where FREE it begins within FREE_START from there on
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
-    end: BoundaryState | None = None
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
     dispensable: bool = field(default=False, compare=False, repr=False)  # given up where it is late: others answered
@@ -49,11 +48,10 @@ class PlanningTask:
             raise InputError(
                 f"the yaw angle must be a finite number, not {self.yaw_angle}", where="yaw_angle", hint="give radians"
             )
-        for name, boundary in (("start", self.start), ("end", self.end)):
-            if boundary and not all(math.isfinite(value) for value in astuple(boundary)):
-                raise InputError(
-                    f"the {name} state is not finite: {boundary}", where=name, hint="leave it out for a path at rest"
-                )
+        if self.start and not all(math.isfinite(value) for value in astuple(self.start)):
+            raise InputError(
+                f"the start state is not finite: {self.start}", where="start", hint="leave it out for a path at rest"
+            )
         if self.speed_caps and not self.speed_caps.lie_within(self.path.end):
             raise InputError(
                 f"speed caps from s = {self.speed_caps.s[0]:g} to {self.speed_caps.s[-1]:g} leave the path, which ends "
@@ -66,16 +64,17 @@ class PlanningTask:
     def _refuse(self) -> Solution | None:
         if reason := infeasible_limit(self.airframe, self.limits):
             return Solution(Status.INFEASIBLE, None, reason)
-        for name, boundary, s in (("start", self.start, 0.0), ("end", self.end, self.path.end)):
-            if boundary and (reason := violated_limit(boundary, self.path, s, self.airframe, self.limits)):
-                return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
-            if boundary and self.speed_caps and (reason := self._violated_cap(boundary, s)):
-                return Solution(Status.BAD_BOUNDARY, None, f"{name}: {reason}")
+        if self.start and (
+            reason := violated_limit(self.start, self.path, 0.0, self.airframe, self.limits)
+            or self._violated_cap(self.start)
+        ):
+            return Solution(Status.BAD_BOUNDARY, None, f"start: {reason}")
         return None
 
-    def _violated_cap(self, boundary: BoundaryState, s: float) -> str:
-        assert self.speed_caps
-        speed, cap = math.sqrt(boundary.h) * math.hypot(*self.path(s, 1)), float(self.speed_caps.at(s))
+    def _violated_cap(self, start: BoundaryState) -> str:
+        if not self.speed_caps:
+            return ""
+        speed, cap = math.sqrt(start.h) * math.hypot(*self.path(0.0, 1)), float(self.speed_caps.at(0.0))
         return f"speed is {speed:.4g} m/s, the cap {cap:.4g} m/s" if speed > (1.0 + BOUNDARY_TOLERANCE) * cap else ""
 
     def check_nodes(self) -> None:

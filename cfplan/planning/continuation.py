@@ -1,6 +1,15 @@
 """Plans that continue a motion, so that the path can change in flight.
 
-The path begins in the state at a joint (path/onward.py); it is planned and certified like any other.
+The new plan takes over at a joint, a moment of the previous trajectory:
+
+    before the joint   the previous trajectory is flown, unchanged
+    at the joint       the new path has γ to γ'''' of the previous motion, and its profile begins with h, h', h'', ψ and
+                       ψ', so attitude and body rates do not jump (vehicle/joint.py)
+    behind the joint   the new path leads through the waypoints to rest; it is chosen within milliseconds
+                       (path/onward.py), and planned and certified like a plan before take-off
+
+For a vehicle at rest there is no joint: the path begins at its hover, and the search may take longer. A joint is a
+moment of the planned motion; air/ turns it into setpoints ahead of the clock.
 """
 
 import math
@@ -40,11 +49,11 @@ SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², deceleration to a lower speed limit, and
 STOPPING = 0.6  # s of the previous path, within which a vehicle that stops comes to rest
 OVERSHOOT = 0.2  # s, for which a vehicle that speeds up continues to do so
 ROOM = 0.005  # fraction of each limit that plans leave to the plan that continues them
-BETWEEN = 0.6  # fraction of ROOM that may be used up between points, which saves rounds of tightening
+ROOM_BETWEEN_POINTS = 0.6  # fraction of ROOM that may be exceeded between points, which saves rounds of tightening
 SEARCH_TIMEOUT = 2.0  # s, for a vehicle at rest
 PLANNER = "expert"  # it keeps boundary states, and takes some 10 ms for 10 m
-_OTHERS = "give other waypoints"
-COARSER = 0.85  # fraction of the usual intervals: such plans take 0.05 % longer, and nine tenths of the time to make
+_OTHER_WAYPOINTS = "give other waypoints"
+INTERVALS_FACTOR = 0.85  # of the usual number: flights take 0.05 % longer, and planning 10 % less
 
 
 class NoWayError(InfeasibleError):
@@ -64,7 +73,7 @@ def continue_plan(
     leave: float,
     waypoints: ArrayLike,
     limits: Limits,
-    *,
+    *,  # options, each of which is used without the others
     reached: ArrayLike = (),
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
@@ -127,7 +136,7 @@ def plan_from_rest(
             speed_factor=min(speed / limits.plan.speed, 1.0),
         )  # fmt: skip
         return Continuation(planned, tuple(found.breaks[found.waypoint[1:]].tolist()))
-    raise NoWayError(f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint=_OTHERS)
+    raise NoWayError(f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint=_OTHER_WAYPOINTS)
 
 
 def check_waypoints(points: NDArray, limits: Limits) -> None:
@@ -155,7 +164,7 @@ def _first_certified(
         if departure.state is not None and speed < limits.plan.speed:
             caps = _slowing_to(speed, path, departure.state)
         task = PlanningTask(
-            path, limits.airframe, tried.plan, round(COARSER * default_nodes(path, PLANNER)), departure.yaw,
+            path, limits.airframe, tried.plan, round(INTERVALS_FACTOR * default_nodes(path, PLANNER)), departure.yaw,
             departure.yaw_angle, start=departure.state,
             speed_caps=caps if caps is None or tried is limits else caps.scaled(1.0 - ROOM),
         )  # fmt: skip
@@ -208,16 +217,18 @@ def _plan(task: PlanningTask, limits: Limits, caps: SpeedCaps | None, factor: fl
 
     Raises InfeasibleError or NotCertifiedError if there is none.
     """
-    solution = plan_early(task, BETWEEN * ROOM) if task.limits is not limits.plan else plan_early(task)
+    solution = plan_early(task, ROOM_BETWEEN_POINTS * ROOM) if task.limits is not limits.plan else plan_early(task)
     if solution.profile is None:
         reason = f" ({' '.join(solution.reason.split())})" if solution.reason else ""
-        raise InfeasibleError(f"{solution.status}{reason}", hint=_OTHERS)
+        raise InfeasibleError(f"{solution.status}{reason}", hint=_OTHER_WAYPOINTS)
     profile = solution.profile if factor == 1.0 else solution.profile.slowed(factor)
     trajectory = Trajectory(task.path, profile, task.airframe)
     certificate = certify(trajectory, limits.plan, limits.space, caps)
     if not certificate.passed:
-        excess = f"{certificate.worst.share - 1.0:.2%}"
-        raise NotCertifiedError(f"the plan exceeds the limit on {certificate.worst.name} by {excess}", hint=_OTHERS)
+        worst = certificate.worst
+        raise NotCertifiedError(
+            f"the plan exceeds the limit on {worst.name} by {worst.share - 1.0:.2%}", hint=_OTHER_WAYPOINTS
+        )
     return Plan(
         path=task.path,
         airframe=task.airframe,

@@ -29,7 +29,7 @@ UPSIDE_DOWN = 3.0  # share of a limit that counts where a measure is not a numbe
 
 
 def lower_locally(task: PlanningTask, profile: SpeedProfile) -> SpeedProfile:
-    """Return the profile, lower where it exceeds a limit of the task; its yaw, and h at boundary states, are kept.
+    """Return the profile, lower where it exceeds a limit of the task; its yaw, and h at the boundary state, are kept.
 
     What is left after the last round is for slowing as a whole. Time and memory grow linearly with the intervals; after
     the task's deadline there are fewer rounds.
@@ -46,10 +46,9 @@ def lower_locally(task: PlanningTask, profile: SpeedProfile) -> SpeedProfile:
         lower = _about_in_time(np.clip(lower, 0.0, MOST), durations, reach)
         by = np.maximum(np.append(lower, lower[-1]), np.append(lower[0], lower))  # at the nodes
         by = np.concatenate([by[:1], by, by[-1:]])
-        for state, of_end, times in ((task.start, by, durations), (task.end, by[::-1], durations[::-1])):
-            if state:
-                of_end[3:] *= np.append(np.minimum(np.cumsum(times) / reach, 1.0)[1:], 1.0)
-                of_end[:3] = 0.0
+        if task.start:
+            by[3:] *= np.append(np.minimum(np.cumsum(durations) / reach, 1.0)[1:], 1.0)
+            by[:3] = 0.0
         logs -= by
         profile = spline_profile(np.exp(logs), path.end, yaw)
     return profile

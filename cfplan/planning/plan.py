@@ -35,7 +35,6 @@ def plan(
     yaw_angle: float = 0.0,
     speed_factor: float = 1.0,
     start: BoundaryState | None = None,
-    end: BoundaryState | None = None,
     deadline: Deadline = NEVER,
     models: tuple[pathlib.Path, ...] = (),
 ) -> Plan:
@@ -54,11 +53,11 @@ def plan(
         InputError: unknown planner, no model for it, speed factor or nodes out of range.
     """
     begun = time.perf_counter()
-    _check_arguments(planner, nodes, speed_factor, bound=start is not None or end is not None)
+    _check_arguments(planner, nodes, speed_factor, bound=start is not None)
     check_space(path, limits.space)
     check_endurance(path.length / limits.plan.speed / speed_factor, limits, "at least ")
     task = PlanningTask(
-        path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, end=end, models=models,
+        path, airframe, limits.plan, yaw=yaw, yaw_angle=yaw_angle, start=start, models=models,
         deadline=deadline.earlier(ANSWERING * deadline.left) if deadline.left < math.inf else NEVER,
     )  # fmt: skip
     best, notes, left_out = choose(planner, task, nodes, limits.space)

@@ -7,12 +7,13 @@ certified.
 """
 
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import CfplanError, InfeasibleError, NotCertifiedError
 from cfplan.machine_code import njit
 from cfplan.numbers import shown
@@ -20,9 +21,11 @@ from cfplan.planners.expert.expert import refinements
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.lowering import lower_locally
+from cfplan.planning.plan_result import Plan
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.slowing import Slowed, slow_until_certified
 from cfplan.safety.space import Space
+from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
@@ -160,6 +163,28 @@ def slow(task: PlanningTask, profile: SpeedProfile, space: Space | None = None, 
     trajectory = Trajectory(task.path, profile, task.airframe)
     slowed = slow_until_certified(trajectory, task.limits, space, caps=task.speed_caps, deadline=task.deadline)
     return Repaired(slowed.trajectory, slowed.certificate, slowed.speed_factor, trajectory.duration, failed=failed)
+
+
+def repair_plan(plan: Plan, profile: SpeedProfile, caps: SpeedCaps | None = None, deadline: Deadline = NEVER) -> Plan:
+    """Return the plan along its path under its limits and these caps, by the profile nearest to `profile` that passes.
+
+    Its speed factor is kept. Raises as repair().
+    """
+    factor, limits = plan.speed_factor, plan.limits
+    task = PlanningTask(
+        plan.path, plan.airframe, limits.plan, nodes=len(profile.s) - 1,
+        speed_caps=caps if caps is None else caps.scaled(1.0 / factor), deadline=deadline,
+    )  # fmt: skip
+    repaired = flown = repair(task, profile.slowed(1.0 / factor), limits.space)
+    if factor < 1.0:
+        flown = slow(replace(task, speed_caps=caps), repaired.trajectory.profile.slowed(factor), limits.space)
+    return replace(
+        plan,
+        trajectory=flown.trajectory,
+        certificate=flown.certificate,
+        repair_speed_factor=plan.repair_speed_factor * repaired.speed_factor,
+        joints=plan.joints if repaired.joints is None else repaired.joints,
+    )
 
 
 def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, float, float]:

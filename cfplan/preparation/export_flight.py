@@ -83,13 +83,17 @@ class ExportedFlight:
 def plan_for_polynomials(
     source: Path, limits: Limits, options: FlightOptions, on_step: OnStep = ignore_steps
 ) -> PlannedFlight:
-    """Plan a path for polynomials, with less angular acceleration; or read a plan as it is. Raises as plan_flight()."""
-    if source.suffix == PLAN_SUFFIX:
+    """Plan a path for polynomials, with less angular acceleration; or read a plan as it is. Raises as plan_flight().
+
+    A plan that is corrected is planned for polynomials too.
+    """
+    if source.suffix == PLAN_SUFFIX and options.correction is None:
         return plan_flight(source, limits, options, on_step)
     gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
     streamed_loss = replace(limits.link_loss, only_warn=True)  # of a stream, which there is none of
     planned = plan_flight(source, replace(limits, plan=gentle, link_loss=streamed_loss), options, on_step)
-    return replace(planned, limits=limits)
+    uncorrected = planned.uncorrected and replace(planned.uncorrected, limits=limits)
+    return replace(planned, limits=limits, uncorrected=uncorrected)
 
 
 def fit_polynomials(

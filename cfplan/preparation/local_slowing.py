@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
 from cfplan.numbers import coordinates
-from cfplan.planners.task import PlanningTask
 from cfplan.planning.plan_result import LocalSlowing, Plan
-from cfplan.planning.repair import repair, slow
+from cfplan.planning.repair import repair_plan
 from cfplan.safety.space import inside
 from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.simulation.link_loss import LinkLossMoments
@@ -185,20 +184,5 @@ def _speed_at(trajectory: Trajectory, s: NDArray) -> NDArray:
 
 def _replanned(plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...], deadline: Deadline) -> Plan:
     """Return the plan under these caps, refined from the nearest one; its speed factor is kept."""
-    factor, limits, profile = plan.speed_factor, plan.limits, nearest.profile.slowed(1.0 / plan.speed_factor)
-    task = PlanningTask(
-        plan.path, plan.airframe, limits.plan, nodes=len(profile.s) - 1, speed_caps=caps.scaled(1.0 / factor),
-        deadline=deadline,
-    )  # fmt: skip
-    repaired = flown = repair(task, profile, limits.space)
-    if factor < 1.0:
-        as_flown = replace(task, speed_caps=caps)
-        flown = slow(as_flown, repaired.trajectory.profile.slowed(factor), limits.space)
-    return replace(
-        plan,
-        trajectory=flown.trajectory,
-        certificate=flown.certificate,
-        repair_speed_factor=plan.repair_speed_factor * repaired.speed_factor,
-        joints=plan.joints if repaired.joints is None else repaired.joints,
-        slowing=LocalSlowing(caps, plan.trajectory.duration, reasons),
-    )
+    repaired = repair_plan(plan, nearest.profile, caps, deadline)
+    return replace(repaired, slowing=LocalSlowing(caps, plan.trajectory.duration, reasons))

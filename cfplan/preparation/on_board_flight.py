@@ -23,7 +23,7 @@ from cfplan.flight.on_board.pieces import Pieces, states_at
 from cfplan.flight.on_board.program import LANDING_PIECES, LANDING_SIZE, OnBoardProgram, with_landing
 from cfplan.flight.on_board.reference import TAIL
 from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.setpoints.encoding import RATE, encode_motion, encode_trajectory
+from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_motion, encode_trajectory
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.planning.plan_result import Plan
@@ -180,7 +180,7 @@ def _mission(plan: Plan, limits: Limits, made: OnBoardTrajectory, on_step: OnSte
         motion = motion_of(stops.reshape(-1, 5, 4), limits.airframe)
         sent = encode_motion(motion, motion.acceleration, gains, space=space)
         results.append(f"by go-to, certified from each of {len(begin)} moments")
-    return Mission(encoded.payloads, sent.reshape(len(begin), count, PAYLOAD_SIZE), limits, encoded.lead)
+    return Mission(encoded.payloads, sent.reshape(len(begin), count, PAYLOAD_SIZE), limits, LEAD)
 
 
 def check_stops(stops: NDArray, limits: Limits) -> None:

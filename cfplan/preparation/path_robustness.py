@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.random_paths import perturbed

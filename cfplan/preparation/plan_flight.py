@@ -11,6 +11,7 @@ from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import PathFile, load_path_file
+from cfplan.numbers import shown
 from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planners.task import PlanningTask
@@ -19,6 +20,7 @@ from cfplan.planning.plan import default_budget, plan
 from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
+from cfplan.planning.repair import repair_plan
 from cfplan.preparation.glitch_assessment import assess_glitches
 from cfplan.preparation.link_loss_assessment import MARGIN, assess_link_loss, assess_link_loss_of_stops
 from cfplan.preparation.local_slowing import Assessment, SimulatedLinkLoss, slow_locally
@@ -26,6 +28,7 @@ from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import check_space
+from cfplan.vehicle.correction import PlanCorrection, corrected
 from cfplan.vehicle.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -44,6 +47,7 @@ class FlightOptions:
     stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
     budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
     models: tuple[Path, ...] = ()  # folders of models to look in first
+    correction: PlanCorrection | None = None  # of a plan file, learned from earlier flights of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +61,7 @@ class PlannedFlight:
     was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
     path_file: PathFile | None = None  # what was planned, where that is known
     fastest: FastestPath | None = None  # the choice of its path, where one was made
+    uncorrected: Plan | None = None  # where the vehicle is wanted, if what it is asked to fly is corrected
 
     def __repr__(self) -> str:
         verdict = "certified" if self.certificate.passed else "not certified"
@@ -134,13 +139,18 @@ def plan_flight(
 ) -> PlannedFlight:
     """Plan a path file, or read a plan file and certify it anew. The certificate may fail: look at it.
 
+    With a correction, the plan of the file is shifted, slowed where that exceeds a limit, and gives way again.
+
     Raises:
         InputError: a file or an option is wrong.
         InfeasibleError: the path leaves the space, no profile keeps the limits, or link loss takes the vehicle outside.
     """
     if isinstance(source, Path) and source.suffix == PLAN_SUFFIX:
-        return _read_plan(source, limits, on_step)
+        read = _read_plan(source, limits, on_step)
+        return read if options is None or options.correction is None else _corrected(read, options, on_step)
     options = options or FlightOptions()
+    if options.correction is not None:
+        raise InputError("a correction is of one plan", where=str(source), hint="name the file of that plan")
     with step(on_step, "path") as results:
         path_file = load_path_file(source) if isinstance(source, Path) else source
         deadline = Deadline.after(default_budget(path_file.path) if options.budget is None else options.budget)
@@ -208,6 +218,21 @@ def give_way(
         if slowed.slowing and deadline.passed:
             results.warn("perhaps more than needed, as the budget of time is spent")
     return slowed, link_loss[0].simulated if link_loss else None
+
+
+def _corrected(planned: PlannedFlight, options: FlightOptions, on_step: OnStep) -> PlannedFlight:
+    """Return the plan that is asked of a vehicle which strays as the options' correction says. Raises as give_way()."""
+    assert options.correction is not None
+    plan, before = planned.plan, planned.duration
+    deadline = Deadline.after(default_budget(plan.path) if options.budget is None else options.budget)
+    with step(on_step, "corrected") as results:
+        path = corrected(plan.trajectory, options.correction).path
+        caps = plan.slowing.caps if plan.slowing else None
+        shifted = repair_plan(replace(plan, path=path), plan.profile, caps, deadline)
+        duration = shifted.trajectory.duration
+        results.append(f"{duration:.2f} s of flight ({shown(100 * (duration / before - 1.0), '+.1f')} %)")
+    shifted, link_loss = give_way(shifted, on_step, deadline)
+    return replace(planned, plan=shifted, link_loss=link_loss, was_read=False, uncorrected=plan)
 
 
 def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:

@@ -13,7 +13,8 @@ import numpy as np
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.pilot.mission import Mission, mission_of
-from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import HOLD, EncodedFlight, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stop_certificate import StopCertificate, certify_stops
 from cfplan.planning.plan_result import Plan

@@ -84,7 +84,8 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
         yield f"on the way from {_text(begin)} to the start", _START_HINT, way
     end, end_yaw = mission.end
     floor, pace = space.low[2], gentle(ground.land_speed)
-    down = descent(end, end_yaw, 0.0, pace, floor, floor - _BENEATH_FLOOR, mission.limits, mission.rate)
+    lowest = floor - _BENEATH_FLOOR
+    down = descent(end, end_yaw, 0.0, pace, floor, lowest, limits=mission.limits, rate=mission.rate)
     yield f"in landing at {_text(end)}", _LANDING_HINT, down
 
 

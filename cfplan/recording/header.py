@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from cfplan.errors import InputError
 from cfplan.files.json_values import json_value, whole_characters
+from cfplan.flight.setpoints.encoding import LEAD, RATE
+from cfplan.geometry.path_file import fingerprint
 from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.space import Box, Cylinder, Obstacle
 from cfplan.vehicle.airframe import Airframe, airframe_of
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
 Triple = tuple[float, float, float]
 
 PROMISED_LATENESS = 2e-3  # s, of all setpoints but one in a hundred
+FINGERPRINT, FLOWN = "path file's fingerprint", "flown"  # keys of the provenance
 _PATH_SAMPLES = 500  # of the drawn path
+_NO_SHIFT = np.empty((0, 3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +65,8 @@ class RecordHeader:
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Where the plan came from: file, model hash, …"""
     obstacles: tuple[Obstacle, ...] = ()
+    shift: NDArray = field(default_factory=_NO_SHIFT.copy)
+    """(N, 3) m, by how much earlier flights corrected setpoints 0 … of the plan; empty where none did."""
 
 
 def header_under(
@@ -126,20 +132,36 @@ def _bounds(limits: Limits) -> FlightBounds:
     )
 
 
-def header_of_plan(plan: "Plan", *, name: str, uri: str, source: FilePath, wall_time_at_zero: float) -> RecordHeader:
-    """Return the header of the flight of a plan that was made from, or read from, `source`."""
-    limits = plan.limits
-    return header_under(
+def header_of_plan(
+    plan: "Plan", *, name: str, uri: str, source: FilePath, wall_time_at_zero: float, uncorrected: "Plan | None" = None
+) -> RecordHeader:
+    """Return the header of the flight of a plan that was made from a path file, or read from a plan file.
+
+    `uncorrected` is the plan where the vehicle is wanted, if what it is asked to fly is corrected. Raises
+    InputError where the path file cannot be read.
+    """
+    limits, wanted = plan.limits, uncorrected or plan
+    header = header_under(
         limits,
         name=name,
         uri=uri,
         planner=plan.planner,
         bounds=_bounds(limits),
         travel_time=plan.trajectory.duration,
-        path=plan.path(np.linspace(0.0, plan.path.end, _PATH_SAMPLES)),
+        path=wanted.path(np.linspace(0.0, wanted.path.end, _PATH_SAMPLES)),
         wall_time_at_zero=wall_time_at_zero,
-        provenance={"path file": str(source), "planner": plan.planner},
+        provenance={"path file": str(source), "planner": plan.planner} | _fingerprint(source),
     )
+    if uncorrected is None:
+        return header
+    times = np.arange(int(np.ceil(plan.trajectory.duration * RATE)) + 2) / RATE + LEAD
+    s = plan.trajectory.s_at(times)
+    return replace(header, shift=np.round(plan.path(s) - uncorrected.path(s), 6))
+
+
+def _fingerprint(source: FilePath) -> dict[str, str]:
+    """Return that of a path file; nothing of a plan file, which holds its motion itself, and where there is no file."""
+    return {} if source.suffix == ".parquet" or not source.is_file() else {FINGERPRINT: fingerprint(source)}
 
 
 def header_to_json(header: RecordHeader) -> str:
@@ -171,6 +193,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
             wall_time_at_zero=_number(values["wall_time_at_zero"]),
             provenance={str(key): str(value) for key, value in values["provenance"].items()},
             obstacles=tuple(map(_obstacle, values.get("obstacles", ()))),
+            shift=np.array(values.get("shift", ()), dtype=float).reshape(-1, 3),
         )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError) as error:
         raise InputError(

@@ -15,7 +15,7 @@ from cfplan.numbers import coordinates, shown
 from cfplan.recording.header import Triple
 from cfplan.recording.importers.mocap_log import LoggedSubject
 from cfplan.recording.record import Record
-from cfplan.recording.summary import reference_span, reference_times
+from cfplan.recording.summary import planned_positions, reference_span, reference_times
 from cfplan.vehicle.trajectory import Trajectory
 
 STEP = 0.01  # s, of the grid on which time is first looked for
@@ -110,7 +110,7 @@ def trial_of_record(record: Record, name: str) -> Trial:
         return Trial(name, poses.time - record.start, poses.position, poses.quaternion, None, record.header.fence)
     wanted = reference_times(record.setpoints)
     along = (wanted >= begin) & (wanted <= end)
-    reference = Reference(record.header.name, wanted[along] - begin, record.setpoints.position[along])
+    reference = Reference(record.header.name, wanted[along] - begin, planned_positions(record)[along])
     return Trial(name, poses.time - begin, poses.position, poses.quaternion, reference, record.header.fence)
 
 

@@ -109,7 +109,8 @@ def _check_plausible(record: Record, file: Path) -> None:
     prisms = np.array([each.prism for each in header.obstacles]).reshape(-1, 8)
     check_values(prisms.ravel(), "the header's obstacles", where=str(file))
     check_places(prisms[:, :3], "the header's obstacles", where=str(file))
-    check_places(np.vstack([record.header.path, record.header.fence]), "the header", where=str(file))
+    check_values(header.shift.ravel(), "the header's shift", where=str(file))
+    check_places(np.vstack([header.path, header.fence, header.shift]), "the header", where=str(file))
 
 
 def is_record(place: Path) -> bool:

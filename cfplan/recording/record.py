@@ -17,6 +17,7 @@ from cfplan.vehicle.rotations import quaternions_of
 FLIGHT_FILE = "flight.mcap"
 SUMMARY_FILE = "summary.json"
 PLAN_FILE = "plan.parquet"
+UNCORRECTED_FILE = "uncorrected.parquet"  # the plan where the vehicle was wanted, if what was sent is corrected
 PLAN_IN_FLIGHT = "plan-{:08x}.parquet"  # by the checksum of its proposal, see Commitments
 
 

@@ -133,6 +133,15 @@ def reference_times(setpoints: Setpoints) -> NDArray:
     return setpoints.due + np.round((setpoints.time - setpoints.due) / period) * period
 
 
+def planned_positions(record: Record) -> NDArray:
+    """Return where the plan has the vehicle at each setpoint, (N, 3) m: what was sent, less a correction."""
+    sent, shift, due = record.setpoints, record.header.shift, _streamed(record)
+    if not (len(shift) and len(due) > 1):
+        return sent.position
+    row = np.round((reference_times(sent) - due[0]) / np.median(np.diff(due)))
+    return np.asarray(sent.position - shift[np.clip(row, 0, len(shift) - 1).astype(int)])
+
+
 def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -> PoseDeviations:
     """Return the deviation of every pose between begin and end that falls in the time of the setpoints."""
     wanted = reference_times(record.setpoints)
@@ -141,7 +150,7 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
     time, position = record.poses.time, record.poses.position
     inside = (time >= max(begin, wanted[0])) & (time <= min(end, wanted[-1])) & np.all(np.isfinite(position), axis=1)
     time, position = time[inside], position[inside]
-    reference = np.stack([np.interp(time, wanted, axis) for axis in record.setpoints.position.T], axis=1)
+    reference = np.stack([np.interp(time, wanted, axis) for axis in planned_positions(record).T], axis=1)
     path = committed_path(record)
     path = path[np.all(np.isfinite(path), axis=1)]
     path = path if len(path) else record.setpoints.position
@@ -187,10 +196,11 @@ def arrival(record: Record) -> tuple[float, float]:
         return math.nan, math.nan
     due = _streamed(record)
     sent = (record.setpoints.due >= begin) & (record.setpoints.due <= due[-1])
-    goal = record.setpoints.position[np.searchsorted(record.setpoints.due, due[-1])]
+    planned = planned_positions(record)
+    goal = planned[np.searchsorted(record.setpoints.due, due[-1])]
     seen = (record.poses.time >= begin) & (record.poses.time <= max(held[1], end))
     vehicle = _from_then_near(record.poses.time[seen], record.poses.position[seen], goal)
-    return vehicle, _from_then_near(reference_times(record.setpoints)[sent], record.setpoints.position[sent], goal)
+    return vehicle, _from_then_near(reference_times(record.setpoints)[sent], planned[sent], goal)
 
 
 def _from_then_near(time: NDArray, position: NDArray, goal: NDArray) -> float:
@@ -213,7 +223,7 @@ def finished(record: Record) -> bool:
         return False
     period = float(np.median(np.diff(due)))
     last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
-    least = committed_time(record) - 2 * period
+    least = committed_time(record) - 3 * period
     return bool(due[-1] - due[0] >= least and last * period >= least)
 
 

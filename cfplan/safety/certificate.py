@@ -8,9 +8,8 @@ Where so much is added that a limit's margin would be overstated, samples are ta
 distance to obstacles is that of the path: see space.py.
 """
 
-import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -20,16 +19,17 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import derivatives_on
 from cfplan.machine_code import njit
 from cfplan.numbers import shown
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import AT_LEAST, QUANTITIES, Quantity
 from cfplan.safety.space import Space, beyond_obstacles, inside
 from cfplan.safety.speed_caps import SpeedCaps
-from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.dense import Segments
-from cfplan.vehicle.measures import measures_of
+from cfplan.vehicle.flatness import Body, compiled_body
+from cfplan.vehicle.measures import MEASURES, measures_of
+from cfplan.vehicle.motion import fill
 from cfplan.vehicle.profile import h_within
 from cfplan.vehicle.trajectory import Trajectory
 
@@ -40,6 +40,7 @@ LEAST_POINTS = 11  # of a piece, its ends included
 WALLS, OBSTACLES = "distance to the walls", "distance to obstacles"
 OF_PLACE = (WALLS, OBSTACLES)  # decided by the path alone, at any speed
 CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
+POSITION = MEASURES  # row of what is searched, behind the measures: m, and the two rows behind
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
 _MOST_ADDED = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
 _NEARER, _TIMES = 4, 2  # so many times as near, so often: past that the flight is so rough that it fails in any case
@@ -116,6 +117,16 @@ class Certificate:
         }
 
 
+class Segments(NamedTuple):
+    """Parts of a flight on which everything is smooth, (K,) each, and how many samples are taken of each."""
+
+    left: NDArray  # s
+    right: NDArray  # s
+    interval: NDArray  # of the profile
+    piece: NDArray  # of the path
+    counts: NDArray  # samples, evenly spaced, both ends included; at least two
+
+
 class _Bound(NamedTuple):
     """A quantity and its limit; `unused` is the value that counts as share 0."""
 
@@ -130,13 +141,13 @@ def certify(
     """Check every limit everywhere; space and speed caps too, where given. Never raises: what is not a number fails."""
     segments, (bounds, table) = segments_of(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
-    source = dense.sample_source(trajectory.airframe, trajectory.path, trajectory.profile)
-    values, added, places = _search(table, walls, BATCH, source, segments)
+    path, body, nodes = trajectory.path, compiled_body(trajectory.airframe), trajectory.timing.nodes
+    values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
     for _ in range(_TIMES):
         if not any(map(_overstated, bounds, values.tolist(), added.tolist())):
             break
         segments = segments._replace(counts=_NEARER * (segments.counts - 1) + 1)
-        values, added, places = _search(table, walls, BATCH, source, segments)
+        values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
     margins = [_margin(*each) for each in peaks]
@@ -167,7 +178,7 @@ def _bounds(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tupl
     """Return the limits that bind; and for compiled code, (Q, 3), the first row of each, how many, and its side."""
     bounds = [_Bound(q, q.allowed(limits), q.unused(airframe)) for q in QUANTITIES if q.allowed(limits) != math.inf]
     if space is not None:
-        walls = Quantity(WALLS, "m", "", "", AT_LEAST, dense.POSITION, 3)  # in place of the position itself
+        walls = Quantity(WALLS, "m", "", "", AT_LEAST, POSITION, 3)  # in place of the position itself
         bounds.append(_Bound(walls, space.margin, half_of(space)))
     return tuple(bounds), np.array([(q.measure, q.count, q.side) for q, _, _ in bounds])
 
@@ -217,7 +228,7 @@ def obstacle_margin(path: Path, space: Space, time_at: Callable[[NDArray], Any])
     """Return the margin of a path's distance to obstacles; `time_at` returns when the flight passes s, in s."""
     s, beyond = beyond_obstacles(path, space)
     worst = np.unravel_index(int(np.argmax(beyond)), beyond.shape)
-    bound = _Bound(Quantity(OBSTACLES, "m", "", "", AT_LEAST, dense.POSITION, 1), space.margin, half_of(space))
+    bound = _Bound(Quantity(OBSTACLES, "m", "", "", AT_LEAST, POSITION, 1), space.margin, half_of(space))
     place, peak = s[worst], float(beyond[worst]) - space.margin
     return _margin(bound, peak, float(time_at(place)), float(place), path(place).tolist())
 
@@ -297,46 +308,47 @@ def _cut(
     return edges[:-1], edges[1:], interval, piece, counts
 
 
-def _parts(segments: Segments, samples: int) -> Iterator[Segments]:
-    """Cut segments into parts of about so many samples."""
-    group = (np.cumsum(segments.counts) - segments.counts) // samples
-    edges = np.flatnonzero(np.diff(group, prepend=-1, append=group[-1] + 1))
-    for begin, end in itertools.pairwise(edges):
-        yield Segments(*(values[begin:end] for values in segments))
-
-
 @njit(error_model="numpy")
 def _search(
-    table: NDArray, walls: NDArray, batch: int, source: dense.SampleSource, segments: Segments
-) -> tuple[NDArray, NDArray, NDArray]:
+    table: NDArray, walls: NDArray, batch: int, body: Body, origins: NDArray, coefficients: NDArray, nodes: NDArray,
+    segments: Segments,
+) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
     """Return the peak of each of the table's quantities, what of it was added to the samples, and s there.
 
     Takes about `batch` samples at a time.
     """
     values, added, places = np.full(len(table), -np.inf), np.zeros(len(table)), np.zeros(len(table))
-    counts, most = segments.counts, 0
-    for n in range(len(counts)):
-        most = max(most, counts[n])
-    rows = np.empty((dense.SAMPLED_ROWS, batch + most))
-    begin = 0
+    counts, begin = segments.counts, 0
     while begin < len(counts):
         end, samples = begin, 0
         while end < len(counts) and samples < batch:
-            piece = segments.piece[end]
-            dense.sample(
-                rows[:, samples : samples + counts[end]], source.body, source.coefficients[piece],
-                source.origins[piece], source.nodes[segments.interval[end]], segments.left[end], segments.right[end],
-            )  # fmt: skip
             samples += counts[end]
             end += 1
-        for axis in range(walls.shape[1]):  # in place of positions, how far from the walls they are
+        s, piece, interval = sampled(segments, begin, end)
+        curve, rows = derivatives_on(origins, coefficients, s, piece), np.empty((MEASURES + walls.shape[1], samples))
+        fill(rows[:MEASURES], body, curve, nodes, s, interval)
+        for axis in range(walls.shape[1]):  # how far from the walls positions are
             middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2
-            position = rows[dense.POSITION + axis]
-            for n in range(samples):
-                position[n] = half - abs(position[n] - middle)
-        raise_peaks(values, added, places, table, rows, rows[dense.PLACE], counts[begin:end])
+            rows[POSITION + axis] = half - np.abs(curve[0, axis] - middle)
+        raise_peaks(values, added, places, table, rows, s, counts[begin:end])
         begin = end
     return values, added, places
+
+
+@njit(error_model="numpy")
+def sampled(segments: Segments, begin: int, end: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return the samples of segments: s, just left of their right ends too, piece of the path, interval of profile."""
+    total = segments.counts[begin:end].sum()
+    s, piece, interval = np.empty(total), np.empty(total, np.int64), np.empty(total, np.int64)
+    first = 0
+    for k in range(begin, end):
+        last, width = segments.counts[k] - 1, segments.right[k] - segments.left[k]
+        for n in range(last + 1):
+            s[first + n] = segments.left[k] + n / last * width
+            piece[first + n], interval[first + n] = segments.piece[k], segments.interval[k]
+        first += last + 1
+        s[first - 1] = np.nextafter(segments.right[k], -np.inf)
+    return s, piece, interval
 
 
 @njit

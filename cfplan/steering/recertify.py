@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.air.certifying import BEHIND, Onward, certify_beginning, certify_whole
+from cfplan.air.certifying import STOP_AND_HOVER, Onward, certify_beginning, certify_whole
 from cfplan.air.stopping import STOPS, stop_within
 from cfplan.air.timeline import Replanned, Timeline, hold, hold_hover, joint_of
 from cfplan.errors import CfplanError, InputError, NotCertifiedError
@@ -162,7 +162,7 @@ def _committed(
         if len(told) == len(onward.encoded(limits).payloads):
             made = certify_whole(onward, limits)
         else:
-            made = certify_beginning(onward, len(told) - BEHIND, limits, foresee=False)
+            made = certify_beginning(onward, len(told) - STOP_AND_HOVER, limits, foresee=False)
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
     if told.shape != made.payloads.shape or (told != made.payloads).any():
@@ -177,7 +177,7 @@ def _committed(
 def _goes_on(onward: Onward, told: NDArray, limits: Limits) -> bool:
     """Return whether setpoints are more of the plan that is flown, and no stop."""
     payloads = onward.encoded(limits).payloads
-    following = len(told) - BEHIND
+    following = len(told) - STOP_AND_HOVER
     if following < 2:  # a stop is as long, and begins like the plan; what is left of a plan is all of it
         return np.array_equal(told, payloads)
     return np.array_equal(told[:following], payloads[:following])

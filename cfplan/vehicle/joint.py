@@ -5,20 +5,16 @@ Position, velocity, acceleration, jerk, attitude and body rates are then continu
 acceleration and motor thrust, may jump by what h''' and ψ'' jump, as at every grid point of a profile.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
+from cfplan.geometry.polynomials import ORDERS
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import FullState, Trajectory
-
-_ORDERS = 5  # γ and four derivatives
-_Answer = TypeVar("_Answer")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +33,7 @@ class Joint:
         """
         moving = trajectory.at(self.time)
         derivatives = np.array([moving.position, moving.velocity, moving.acceleration, moving.jerk, moving.snap])
-        derivatives /= rate ** np.arange(_ORDERS)[:, None]
+        derivatives /= rate ** np.arange(ORDERS)[:, None]
         derivatives.setflags(write=False)
         turning = self.state.dyaw * self.state.h**0.5
         return Joint(self.time, self.s, derivatives, BoundaryState(rate**2, 0.0, 0.0, self.state.yaw, turning / rate))
@@ -54,7 +50,7 @@ def joint_at(trajectory: Trajectory, time: float) -> Joint:
     s = float(trajectory.s_at(time))
     sample = trajectory.profile.at(np.array([s]))
     state = BoundaryState(*(float(each[0]) for each in (sample.h, sample.dh, sample.ddh, sample.yaw, sample.dyaw)))
-    derivatives = np.array([trajectory.path(s, order) for order in range(_ORDERS)])
+    derivatives = trajectory.path.derivatives(np.array([s]))[..., 0]
     derivatives.setflags(write=False)
     return Joint(float(time), s, derivatives, state)
 
@@ -88,38 +84,15 @@ class JoinedTrajectory:
 
     def at(self, time: ArrayLike) -> FullState:
         """Return the full state at each time, (N,) s; before the first start and after the end it hovers."""
-        times = np.atleast_1d(np.asarray(time, dtype=float))
-        order, parts = self._on_legs(times, Trajectory.at)
-        merged = {
-            field.name: _merged([getattr(each, field.name) for each in parts], order) for field in fields(FullState)
-        }
-        merged["time"] = times
-        state = FullState(**merged)
-        return state if np.ndim(time) else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
-
-    def specific_thrust_at(self, times: NDArray) -> NDArray:
-        """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
-        order, parts = self._on_legs(times, Trajectory.specific_thrust_at)
-        return _merged(parts, order)
-
-    def body_rate_at(self, times: NDArray) -> NDArray:
-        """Return (N, 3) rad/s likewise."""
-        order, parts = self._on_legs(times, Trajectory.body_rate_at)
-        return _merged(parts, order)
-
-    def acceleration_at(self, times: NDArray) -> NDArray:
-        """Return (N, 3) m/s² likewise."""
-        order, parts = self._on_legs(times, Trajectory.acceleration_at)
-        return _merged(parts, order)
-
-    def _on_legs(self, times: NDArray, ask: Callable[[Trajectory, NDArray], _Answer]) -> tuple[NDArray, list[_Answer]]:
-        """Ask each trajectory about the times at which it is flown; return their order, and the answers."""
-        leg = np.clip(np.searchsorted(self.starts, times, side="right") - 1, 0, len(self.starts) - 1)
-        if len(leg) and leg.min() == leg.max():
-            return np.arange(len(leg)), [ask(self.trajectories[leg[0]], times - self.starts[leg[0]])]
-        flown = [np.flatnonzero(leg == each) for each in np.unique(leg)]
-        answers = [ask(self.trajectories[leg[rows[0]]], times[rows] - self.starts[leg[rows[0]]]) for rows in flown]
-        return np.argsort(np.concatenate(flown), kind="stable"), answers
+        times = np.asarray(time, dtype=float)
+        flat = times.reshape(-1)
+        leg = np.maximum(np.searchsorted(self.starts, flat, side="right") - 1, 0)
+        flown = {k: np.flatnonzero(leg == k) for k in np.unique(leg)}
+        states = [self.trajectories[k].at(flat[rows] - self.starts[k]) for k, rows in flown.items()]
+        order = np.argsort(np.concatenate(list(flown.values())))
+        merged = {name: np.concatenate([getattr(each, name) for each in states])[order] for name in FullState.__slots__}
+        state = FullState(**merged | {"time": flat})
+        return state if times.ndim else state.rows(0)
 
     def since(self, time: float) -> "JoinedTrajectory":
         """Return the same flight on a clock that is 0 at `time`, s, without what is flown LOOK_BACK before."""
@@ -138,7 +111,3 @@ class JoinedTrajectory:
         """Return the flight that is this one until `time`, s, and then the trajectory."""
         kept = int(np.searchsorted(self.starts, time, side="left"))
         return JoinedTrajectory((*self.trajectories[:kept], trajectory), (*self.starts[:kept], time))
-
-
-def _merged(parts: list[NDArray], order: NDArray) -> NDArray:
-    return parts[0] if len(parts) == 1 else np.asarray(np.concatenate(parts)[order])

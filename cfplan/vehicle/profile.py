@@ -7,6 +7,7 @@ import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 from cfplan.vehicle.rotations import Scalar
 
@@ -55,7 +56,8 @@ class SpeedProfile:
 
     def interval(self, s: NDArray) -> NDArray:
         """Return the index of the interval in which s lies; a grid point belongs to the interval on its right."""
-        return np.clip(np.searchsorted(self.s, s, side="right") - 1, 0, len(self.s) - 2)
+        s = np.asarray(s, dtype=float)
+        return intervals_of(self.s, s.ravel()).reshape(s.shape)
 
     def at(self, s: NDArray, interval: NDArray | None = None) -> ProfileSample:
         """Return the profile at s, by the polynomials of `interval` where given (for the left of a grid point)."""

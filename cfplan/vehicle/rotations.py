@@ -31,6 +31,13 @@ def heading_of(quaternion: Quaternion) -> tuple[Scalar, Scalar]:
 
 
 @register_jitable
+def direction(x: float, y: float) -> tuple[float, float]:
+    """Return cosine and sine of atan2(y, x)."""
+    size = math.sqrt(x * x + y * y)
+    return (x / size, y / size) if size > 0.0 else (1.0, 0.0)
+
+
+@register_jitable
 def yaw_of(quaternion: Quaternion) -> Scalar:
     """Return yaw, rad, of the Euler angles ZYX: the heading of the body's x axis."""
     x, y = heading_of(quaternion)

@@ -11,6 +11,7 @@ from numba.extending import register_jitable
 from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 
@@ -184,8 +185,8 @@ def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
                         more[row, column] = polynomials[row, column]
                 polynomials = more
             middle = (left + right) / 2.0
-            duration = _summed(parts, node, left, right)
-            halves = _summed(parts, node, left, middle) + _summed(parts, node, middle, right)
+            duration = _quadrature(parts, node, left, right)
+            halves = _quadrature(parts, node, left, middle) + _quadrature(parts, node, middle, right)
             _invert(polynomials[count], node, left, right, duration)
             good = abs(duration - halves) < TOLERANCE + 1e-14 * duration
             if good and _inverse_error(polynomials[count], node, left, duration, parts) < 1e-10:
@@ -213,51 +214,31 @@ def _longer(array: NDArray) -> NDArray:
 
 @njit(error_model="numpy")
 def _duration(nodes: NDArray) -> float:
-    total = 0.0
+    total, parts = 0.0, np.empty(len(_NODES))
     for k in range(len(nodes) - 1):
-        total += _quadrature(nodes[k], nodes[k, 0], nodes[k + 1, 0])
+        total += _quadrature(parts, nodes[k], nodes[k, 0], nodes[k + 1, 0])
     return total
 
 
 @njit(error_model="numpy")
 def _times(edges: NDArray, time: NDArray, interval: NDArray, nodes: NDArray, places: NDArray) -> NDArray:
-    out = np.empty(len(places))
-    piece = 0
+    places = np.minimum(np.maximum(places, edges[0]), edges[-1])
+    piece, out, parts = intervals_of(edges, places), np.empty(len(places)), np.empty(len(_NODES))
     for n in range(len(places)):
-        place = min(max(places[n], edges[0]), edges[-1])
-        piece = _piece(edges, place, piece)
-        out[n] = time[piece] + _quadrature(nodes[interval[piece]], edges[piece], place)
+        k = piece[n]
+        out[n] = time[k] + _quadrature(parts, nodes[interval[k]], edges[k], places[n])
     return out
 
 
 @njit(error_model="numpy")
 def _places(edges: NDArray, time: NDArray, polynomial: NDArray, times: NDArray) -> NDArray:
-    out = np.empty(len(times))
-    piece = 0
+    times = np.minimum(np.maximum(times, 0.0), time[-1])
+    piece, out = intervals_of(time, times), np.empty(len(times))
     for n in range(len(times)):
-        moment = min(max(times[n], 0.0), time[-1])
-        piece = _piece(time, moment, piece)
-        offset = _horner(polynomial[piece], (moment - time[piece]) / (time[piece + 1] - time[piece]))
-        out[n] = min(max(edges[piece] + offset, edges[piece]), edges[piece + 1])
+        k = piece[n]
+        offset = _horner(polynomial[k], (times[n] - time[k]) / (time[k + 1] - time[k]))
+        out[n] = min(max(edges[k] + offset, edges[k]), edges[k + 1])
     return out
-
-
-@njit(error_model="numpy")
-def _piece(edges: NDArray, value: float, guess: int) -> int:
-    """Return the piece that holds the value, an edge the one on its right; fast where it is near the guess."""
-    last = len(edges) - 2
-    if edges[guess] <= value:
-        for piece in range(guess, min(guess + 4, last)):
-            if value < edges[piece + 1]:
-                return piece
-    below, above = 0, last + 1
-    while above - below > 1:
-        middle = (below + above) // 2
-        if edges[middle] <= value:
-            below = middle
-        else:
-            above = middle
-    return below
 
 
 @njit(error_model="numpy")
@@ -268,18 +249,11 @@ def _h(node: NDArray, s: float) -> float:
 
 
 @njit(error_model="numpy")
-def _quadrature(node: NDArray, left: float, right: float) -> float:
-    """Return the time, s, from `left` to `right`, both in the interval."""
-    width = right - left
-    total = 0.0
-    for k in range(len(_NODES)):
-        total += _WEIGHTS[k] / np.sqrt(_h(node, left + width * _NODES[k]))
-    return width * total
+def _quadrature(parts: NDArray, node: NDArray, left: float, right: float) -> float:
+    """Return the time, s, from `left` to `right`, both in the interval; `parts`, (8,), are to be overwritten.
 
-
-@njit(error_model="numpy")
-def _summed(parts: NDArray, node: NDArray, left: float, right: float) -> float:
-    """Return _quadrature(), from parts, (8,), which a compiler finds several at once and adds up in their order."""
+    The compiler finds several of them at once.
+    """
     width = right - left
     for k in range(len(_NODES)):
         parts[k] = _WEIGHTS[k] / np.sqrt(_h(node, left + width * _NODES[k]))
@@ -321,7 +295,7 @@ def _inverse_error(polynomial: NDArray, node: NDArray, left: float, duration: fl
     worst = 0.0
     for share in _PROBES:
         place = left + _horner(polynomial, share)
-        late = abs(_summed(parts, node, left, place) - duration * share) * max(1.0, np.sqrt(_h(node, place)))
+        late = abs(_quadrature(parts, node, left, place) - duration * share) * max(1.0, np.sqrt(_h(node, place)))
         if not late <= worst:
             worst = late if np.isfinite(late) else np.inf
     return worst

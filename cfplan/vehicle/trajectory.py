@@ -7,18 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.path import Path
-from cfplan.machine_code import njit
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.dense import (
-    STATES,
-    SampleSource,
-    accelerations_at,
-    body_rates_at,
-    flat_states,
-    rest_outside,
-    sample_source,
-    thrusts_at,
-)
+from cfplan.vehicle.motion import STATE_ROWS, STATES, states_at
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import Timing, measure
 
@@ -45,6 +35,10 @@ class FullState:
     thrust_axis: NDArray  # (N, 3) body z in the world
     motor_thrust: NDArray  # (N, 4) N, motors 1 to 4
 
+    def rows(self, which: int | slice) -> "FullState":
+        """Return one of the states, or some."""
+        return FullState(*(getattr(self, name)[which] for name in FullState.__slots__))
+
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
@@ -57,11 +51,9 @@ class Trajectory:
     profile: SpeedProfile
     airframe: Airframe
     timing: Timing = field(init=False, repr=False)
-    source: SampleSource = field(init=False, repr=False, compare=False)  # what states are computed from
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timing", measure(self.profile))
-        object.__setattr__(self, "source", sample_source(self.airframe, self.path, self.profile))
         start, end = float(self.profile.s[0]), float(self.profile.s[-1])
         if abs(start) > _SAME_S or abs(end - self.path.end) > _SAME_S * (1.0 + self.path.end):
             raise NotCertifiedError(
@@ -88,51 +80,24 @@ class Trajectory:
         times = np.asarray(time, dtype=float)
         flat = times.reshape(-1)
         s = self.s_at(flat)
-        table = flat_states(self.source, self.path.breaks, s)
-        rest_outside(table, flat, self.duration, self.airframe.hover_thrust)
-        state = _of_table(table, s, flat)
-        return state if times.ndim else FullState(*(getattr(state, name)[0] for name in FullState.__slots__))
+        curve, interval = self.path.derivatives(s), self.profile.interval(s)
+        rows = states_at(self.airframe, curve, self.timing.nodes, s, interval)
+        outside = ~((flat >= 0.0) & (flat <= self.duration))
+        if outside.any():
+            rows[:, outside] = self._hover(rows[STATES["yaw"], outside])
+        state = state_of(flat, s, curve, rows)
+        return state if times.ndim else state.rows(0)
 
-    def specific_thrust_at(self, times: NDArray) -> NDArray:
-        """Return (N,) m/s²: what at() gives of it at each time, (N,) s, in a third of the time."""
-        thrust = thrusts_at(self.source, self.path.breaks, self.s_at(times))
-        _rest(thrust, times, self.duration, GRAVITY)
-        return thrust[0]
-
-    def body_rate_at(self, times: NDArray) -> NDArray:
-        """Return (N, 3) rad/s likewise."""
-        rate = body_rates_at(self.source, self.path.breaks, self.s_at(times))
-        _rest(rate, times, self.duration, 0.0)
-        return rate.T
-
-    def acceleration_at(self, times: NDArray) -> NDArray:
-        """Return (N, 3) m/s² likewise."""
-        acceleration = accelerations_at(self.source, self.path.breaks, self.s_at(times))
-        _rest(acceleration, times, self.duration, 0.0)
-        return acceleration.T
+    def _hover(self, yaw: NDArray) -> NDArray:
+        """Return the full states of a level hover at each yaw, (N,) rad, as states_at() has them."""
+        rows, zero = np.zeros((STATE_ROWS, len(yaw))), np.zeros(len(yaw))
+        rows[STATES["thrust_axis"]] = np.array([[0.0], [0.0], [1.0]])
+        rows[STATES["motor_thrust"]] = self.airframe.hover_thrust
+        rows[STATES["quaternion"]] = zero, zero, np.sin(yaw / 2.0), np.cos(yaw / 2.0)
+        rows[STATES["yaw"]], rows[STATES["specific_thrust"]] = yaw, GRAVITY
+        return rows
 
 
-@njit
-def _rest(rows: NDArray, times: NDArray, duration: float, value: float) -> None:
-    """Give rows, (K, N), the value that they have at rest at times before 0 and after the duration, s."""
-    for n in range(len(times)):
-        if not 0.0 <= times[n] <= duration:
-            for row in range(len(rows)):
-                rows[row, n] = value
-
-
-def state_at(
-    path: Path,
-    profile: SpeedProfile,
-    airframe: Airframe,
-    s: NDArray,
-    *,
-    time: NDArray,
-    interval: NDArray | None = None,
-) -> FullState:
-    """Return the full state at s, (N,), by the polynomials of `interval` where given (see SpeedProfile.at)."""
-    return _of_table(flat_states(sample_source(airframe, path, profile), path.breaks, s, interval), s, time)
-
-
-def _of_table(table: NDArray, s: NDArray, time: NDArray) -> FullState:
-    return FullState(time=time, s=s, **{name: table[rows].T for name, rows in STATES.items()})
+def state_of(time: NDArray, s: NDArray, curve: NDArray, rows: NDArray) -> FullState:
+    """Return full states, by name, of what states_at() gives at s, (N,), on a curve, (5, 3, N)."""
+    return FullState(time=time, s=s, position=curve[0].T, **{name: rows[where].T for name, where in STATES.items()})

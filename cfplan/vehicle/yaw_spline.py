@@ -50,29 +50,22 @@ class YawSpline:
         mode: YawMode,
         angle: float,
         start: BoundaryState | None = None,
-        end: BoundaryState | None = None,
     ) -> "YawSpline":
         """Return the yaw that `mode` gives over `nodes` intervals: tangent, or else fixed."""
-        return (cls.tangent if mode is YawMode.TANGENT else cls.fixed)(path, nodes, angle, start, end)
+        return (cls.tangent if mode is YawMode.TANGENT else cls.fixed)(path, nodes, angle, start)
 
     @classmethod
-    def fixed(
-        cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None, end: BoundaryState | None = None
-    ) -> "YawSpline":
-        """Return one angle all along, which begins and ends with the yaw of boundary states where given."""
-        if start is None and end is None:
-            return cls(np.full(nodes + 1, angle), np.zeros(nodes + 1), np.zeros(nodes))
-        if start is not None and end is None:  # the turn of 2π that is nearest
-            if abs(start.yaw - angle) < _STILL and abs(start.dyaw) < _STILL:  # it stays as it is
-                return cls(np.full(nodes + 1, start.yaw), np.zeros(nodes + 1), np.zeros(nodes))
-            angle += 2 * np.pi * np.round((start.yaw - angle) / (2 * np.pi))
+    def fixed(cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None) -> "YawSpline":
+        """Return one angle all along, which begins with the yaw of a boundary state where given."""
+        still = start is not None and abs(start.yaw - angle) < _STILL and abs(start.dyaw) < _STILL
+        if start is None or still:
+            return cls(np.full(nodes + 1, start.yaw if start else angle), np.zeros(nodes + 1), np.zeros(nodes))
+        angle += 2 * np.pi * np.round((start.yaw - angle) / (2 * np.pi))  # the turn of 2π that is nearest
         target = np.full(2 * nodes + 1, angle)
-        return _fit(path, nodes, target, np.ones_like(target), start, end)
+        return _fit(path, nodes, target, np.ones_like(target), start)
 
     @classmethod
-    def tangent(
-        cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None, end: BoundaryState | None = None
-    ) -> "YawSpline":
+    def tangent(cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None) -> "YawSpline":
         """Return the horizontal direction of flight; `angle` for a path that goes straight up or down."""
         s = np.linspace(0.0, path.end, SAMPLES * nodes + 1)
         inside = np.clip(s, 1e-4 * path.end, (1 - 1e-4) * path.end)  # at a rest end γ' = 0 has no direction
@@ -81,26 +74,24 @@ class YawSpline:
         share = np.hypot(tangent[:, 0], tangent[:, 1])
         seen = share > LEVEL
         if not seen.any():
-            return cls.fixed(path, nodes, angle, start, end)
+            return cls.fixed(path, nodes, angle, start)
         heading = np.unwrap(np.arctan2(tangent[seen, 1], tangent[seen, 0]))
         if start is not None:  # the turn of 2π that is nearest
             heading += 2 * np.pi * np.round((start.yaw - heading[0]) / (2 * np.pi))
         every = SAMPLES // 2
         wanted = np.interp(s[::every], s[seen], heading)
         weight = np.where(seen[::every], share[::every] ** 2, 0.0)
-        return _fit(path, nodes, wanted, np.maximum(weight, 1e-6), start, end)
+        return _fit(path, nodes, wanted, np.maximum(weight, 1e-6), start)
 
     @classmethod
-    def smoothed(cls, yaw: NDArray, step: float, start: BoundaryState | None, end: BoundaryState | None) -> "YawSpline":
+    def smoothed(cls, yaw: NDArray, step: float, start: BoundaryState | None) -> "YawSpline":
         """Return a smooth spline through angles at the nodes, (N+1,), smoothed by a Gaussian.
 
-        The first and last angle count as if they went on. Yaw and its rate are those of boundary states where given.
+        The first and last angle count as if they went on. Yaw begins in a boundary state where given.
         """
         coefficients = _smooth(np.asarray(yaw, dtype=float))
         if start is not None:
             coefficients[:2] = end_coefficients(start.yaw, start.dyaw * step)
-        if end is not None:
-            coefficients[-2:] = end_coefficients(end.yaw, end.dyaw * step)
         return cls.from_coefficients(coefficients, step)
 
     @classmethod
@@ -157,25 +148,17 @@ def _turn_from(start: BoundaryState, target: NDArray, spacing: float, end: float
     return np.asarray((1 - x) ** 3 * ((1 + 3 * x + 6 * x**2) * away + x * (1 + 3 * x) * length * turning))
 
 
-def _fit(
-    path: Path,
-    nodes: int,
-    target: NDArray,
-    weight: NDArray,
-    start: BoundaryState | None,
-    end: BoundaryState | None,
-) -> YawSpline:
+def _fit(path: Path, nodes: int, target: NDArray, weight: NDArray, start: BoundaryState | None) -> YawSpline:
     """Fit to a target at nodes and midpoints, (2 nodes + 1,)."""
     step, size = path.end / nodes, nodes + 2
+    known, own = np.full(size, np.nan), np.ones(size, dtype=np.int64)
     if start is not None:
         target = target + _turn_from(start, target, step / 2, path.end)
-    first, last, known = np.arange(2), np.arange(size - 2, size), np.full(size, np.nan)
-    own = np.ones(size, dtype=np.int64)
-    for boundary, s, at in ((start, 0.0, first), (end, path.end, last)):
-        if boundary is not None:
-            known[at], own[at] = end_coefficients(boundary.yaw, boundary.dyaw * step), 0
-        elif np.linalg.norm(path(s, 1)) < _REST:  # nothing turns there: both have one value
-            own[at[1]] = 0
+        known[:2], own[:2] = end_coefficients(start.yaw, start.dyaw * step), 0
+    elif np.linalg.norm(path(0.0, 1)) < _REST:  # nothing turns there: the first two have one value
+        own[1] = 0
+    if np.linalg.norm(path(path.end, 1)) < _REST:
+        own[-1] = 0
     coefficients = _fitted(target, weight, (SMOOTHING_LENGTH / step) ** 4, own.cumsum() - 1, known)
     return YawSpline.from_coefficients(coefficients, step)
 

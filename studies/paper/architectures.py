@@ -12,7 +12,8 @@ from types import MappingProxyType
 import numpy as np
 
 from cfplan.errors import CfplanError
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.geometry.path import Path
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.learned import plan_learned

@@ -36,12 +36,12 @@ from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.survey import Surveyor
 from cfplan.flight.mocap.uri import parse_uri
 from cfplan.flight.radio import connection
+from cfplan.flight.radio.crtp import LARGEST_PAYLOAD
 from cfplan.flight.telemetry import Estimate, Event, Level, VehicleStatus
 from cfplan.recording.mavlink.bridge import GroundStation, Place
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD
 from cfplan.simulation.virtual_vicon.server import Connection, Picture, Shown
 from cfplan.vehicle.airframes import AIRFRAMES
 from tests.bad_input.faults import FLOATS, TEXTS, spoil_bytes, spoil_packets

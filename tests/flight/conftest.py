@@ -225,7 +225,7 @@ class World:
         if self.deaf or self.stopped or self.uplink_dead:
             return
         self.motors_on = True
-        state = decode(np.frombuffer(bytes(packet.data), dtype=np.uint8))
+        state = decode(np.frombuffer(packet[1:], dtype=np.uint8))
         (x, y, z), self._asked = state.position[0].tolist(), tuple(state.velocity[0].tolist())
         self.position = x, y if self.push is None else self.position[1], max(z, self.floor)
 

@@ -83,7 +83,7 @@ def test_speed_is_gathered_monotonically(turns):
     path.check()
 
 
-@pytest.mark.parametrize("order", range(5))
+@pytest.mark.parametrize("order", range(4))
 def test_derivatives_are_slopes_across_the_re_timed_stretch(order):
     path = with_rest_ends(*close_joints(*helix()))
     step = 1e-5

@@ -9,7 +9,8 @@ from stepped_flight import fly_stepped
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.mission import mission_of
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.telemetry import SetpointSent
 from cfplan.geometry.path_file import load_path_file
 from cfplan.planning.plan import plan

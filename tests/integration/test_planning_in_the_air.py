@@ -16,8 +16,9 @@ from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.proposals import HeldProposals
+from cfplan.flight.setpoints.byte_check import check_bytes
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal, checksum_of
-from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import DURATION

@@ -16,6 +16,7 @@ from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.pilot import Pilot
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, Action
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Phase, PhaseEntered
@@ -28,7 +29,6 @@ from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
 from cfplan.simulation.virtual_crazyflie.parameters import parameter_toc
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 
 REPOSITORY = Path(__file__).parents[2]
 LIMITS = load_limits(REPOSITORY / "safety.yaml")

@@ -137,13 +137,6 @@ def test_a_start_state_is_met_exactly(model):
     Trajectory(PATH, solution.profile, CHOSEN.airframe)
 
 
-def test_an_end_state_is_met_exactly(model):
-    state = BoundaryState(h=0.6, dh=0.0, ddh=0.0, yaw=0.1, dyaw=0.0)
-    found = plan(model, nodes=120, end=state).profile.boundary(-1)
-    assert (found.h, found.dh, found.ddh) == pytest.approx((0.6, 0.0, 0.0), abs=1e-9)
-    assert found.yaw == pytest.approx(0.1)
-
-
 def test_a_boundary_state_beyond_the_limits_is_refused(model):
     solution = plan(model, start=BoundaryState(h=-1.0, dh=0.0, ddh=0.0, yaw=0.0, dyaw=0.0))
     assert solution.status is Status.BAD_BOUNDARY

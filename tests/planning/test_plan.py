@@ -132,13 +132,13 @@ def test_a_boundary_state_is_never_slowed_away(path, limits, make_profile, monke
         plan(path, limits.airframe, limits, planner="toppquad", start=fast.boundary(0), speed_factor=0.5)
 
 
-def test_yaw_and_boundary_states_reach_the_planner(path, limits, make_profile, monkeypatch):
+def test_yaw_and_the_boundary_state_reach_the_planner(path, limits, make_profile, monkeypatch):
     slow = make_profile(path.end, np.full(40, 0.1))
     calls = stub(monkeypatch, toppquad=lambda path, nodes: Solution(Status.SOLVED, slow))
-    end = slow.boundary(-1)
-    plan(path, limits.airframe, limits, planner="toppquad", yaw=YawMode.TANGENT, yaw_angle=0.3, end=end)
+    start = slow.boundary(0)
+    plan(path, limits.airframe, limits, planner="toppquad", yaw=YawMode.TANGENT, yaw_angle=0.3, start=start)
     task = calls[0][2]
-    assert (task.yaw, task.yaw_angle, task.start, task.end) == (YawMode.TANGENT, 0.3, None, end)
+    assert (task.yaw, task.yaw_angle, task.start) == (YawMode.TANGENT, 0.3, start)
 
 
 def test_a_path_outside_the_space_is_refused_before_any_planner_runs(limits, monkeypatch):

@@ -21,19 +21,18 @@ from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.continuation import check_waypoints
 from cfplan.planning.plan import plan
-from cfplan.safety.certificate import WALLS, certify, share_of
+from cfplan.safety.certificate import POSITION, WALLS, certify, share_of
 from cfplan.safety.limits import Ladder
 from cfplan.safety.quantities import AT_LEAST, Quantity
 from cfplan.safety.space import TOLERANCE, Space, check_space
 from cfplan.simulation.link_loss import LinkLoss
-from cfplan.vehicle import dense
 from cfplan.vehicle.hover import hover_at
 from cfplan.vehicle.trajectory import Trajectory
 
 ROOMS = 10_000
 BEYOND = (0.0, 0.5 * TOLERANCE, 2.0 * TOLERANCE, 0.02)  # m beyond the margin
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-WALL = Quantity(WALLS, "m", "", "", AT_LEAST, dense.POSITION, 3)
+WALL = Quantity(WALLS, "m", "", "", AT_LEAST, POSITION, 3)
 
 
 def rooms(count):

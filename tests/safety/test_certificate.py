@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.safety.certificate import certify, raise_peaks, segments_of
+from cfplan.safety.certificate import certify, raise_peaks, sampled, segments_of
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
 from cfplan.safety.space import Space
-from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.trajectory import Trajectory
@@ -134,11 +133,7 @@ def test_one_value_that_is_not_finite_fails(wrong):
 
 def test_samples_are_a_millisecond_apart_at_most_and_at_least_ten_to_an_interval(trajectory):
     segments = segments_of(trajectory)
-    body, coefficients, origins, nodes = dense.sample_source(AIRFRAME, trajectory.path, trajectory.profile)
-    sampled = [np.empty((dense.SAMPLED_ROWS, count)) for count in segments.counts]
-    for rows, left, right, interval, piece, _ in zip(sampled, *segments, strict=True):
-        dense.sample(rows, body, coefficients[piece], origins[piece], nodes[interval], left, right)
-    s = np.concatenate(sampled, axis=1)[dense.PLACE]
+    s, _, _ = sampled(segments, 0, len(segments.counts))
     assert np.diff(trajectory.time_at(s)).max() <= 1.001e-3
     assert np.bincount(np.repeat(segments.interval, segments.counts)).min() >= 10
     assert len(segments.counts) >= len(np.union1d(trajectory.profile.s, trajectory.path.breaks)) - 1

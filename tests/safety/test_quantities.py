@@ -12,7 +12,8 @@ from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot import abort_monitor
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints import stop_certificate
-from cfplan.flight.setpoints.encoding import RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Estimate, VehicleStatus
 from cfplan.geometry.min_snap import min_snap

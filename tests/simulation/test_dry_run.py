@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.firmware import FLIES_AS_PREDICTED, gains_for
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.packets import encode
 from cfplan.geometry.min_snap import min_snap
 from cfplan.safety.limits import FlightLimits, Ladder, PlanLimits

@@ -112,9 +112,12 @@ def test_starts_that_do_not_fit_are_refused(trajectory):
         JoinedTrajectory((trajectory, trajectory), (1.0, 1.0))
 
 
-@pytest.mark.parametrize("name", ["specific_thrust", "body_rate", "acceleration"])
-def test_a_part_of_the_state_is_that_of_the_trajectory_flown_then(trajectory, name):
-    joined = JoinedTrajectory((trajectory, trajectory, trajectory), (0.0, 1.1, 2.3))
+def test_at_any_time_the_state_is_that_of_the_trajectory_flown_then(trajectory):
+    starts = (0.0, 1.1, 2.3)
+    joined = JoinedTrajectory((trajectory, trajectory, trajectory), starts)
     times = np.random.default_rng(7).uniform(-0.5, joined.duration + 0.5, 200)
-    part = getattr(joined, f"{name}_at")
-    np.testing.assert_allclose(part(times), getattr(joined.at(times), name), rtol=1e-12, atol=1e-12)
+    found, since = joined.at(times), np.select([times < starts[1], times < starts[2]], starts[:2], starts[2])
+    expected = trajectory.at(times - since)
+    np.testing.assert_array_equal(found.time, times)
+    for name in ("s", "position", "body_rate", "motor_thrust", "quaternion"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12, atol=1e-12)

@@ -156,9 +156,9 @@ def test_a_profile_of_another_path_is_refused(make_profile):
         Trajectory(min_snap(WAYPOINTS), make_profile(3.0, np.ones(20)), AIRFRAMES["crazyflie-2.1+"])
 
 
-@pytest.mark.parametrize("name", ["specific_thrust", "body_rate", "acceleration"])
-def test_a_part_of_the_state_is_that_of_the_whole_at_any_times_in_any_order(trajectory, name):
+def test_times_may_come_in_any_order(trajectory):
     times = np.random.default_rng(6).uniform(-0.5, trajectory.duration + 0.5, 300)
-    part = getattr(trajectory, f"{name}_at")
-    np.testing.assert_allclose(part(times), getattr(trajectory.at(times), name), rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(part(times[:1]), part(times)[:1], rtol=1e-12, atol=1e-12)
+    order = np.argsort(times)
+    found, ordered = trajectory.at(times), trajectory.at(times[order])
+    for name in ("position", "body_rate", "motor_thrust"):
+        np.testing.assert_allclose(getattr(found, name)[order], getattr(ordered, name), rtol=1e-12, atol=1e-12)

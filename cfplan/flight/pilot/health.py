@@ -1,6 +1,6 @@
 """Health: how recently the pilot heard each of its sources, and the table of its reactions to each combination.
 
-There are four sources: the uplink (answers to cflib's pings, which acknowledge that the vehicle hears), its two logs
+There are four sources: the uplink (answers to pings, which acknowledge that the vehicle hears), its two logs
 (estimate and status), and the poses that reach the vehicle. Each is fresh, late or gone. The pilot computes the health
 once a tick; the abort ladder, holding and landing react to silence by it.
 
@@ -20,7 +20,7 @@ from cfplan.flight.firmware import Timeouts
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.safety.limits import PoseLimits
 
-UPLINK_LATE = 0.25  # s without an answer to cflib's pings, ten a second
+UPLINK_LATE = 0.25  # s without an answer to pings, ten a second
 UPLINK_GONE = Timeouts().level_out  # s; a vehicle without a setpoint for this long leaves its stream
 LOG_GONE = 0.6  # s without a message of one of the vehicle's logs; of a dead radio the uplink is gone before them
 _LONGEST_STEP = 0.05  # s of silence counted between two ticks at most; beyond it this computer stalled

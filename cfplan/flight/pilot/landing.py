@@ -135,7 +135,9 @@ class Landing:
         """Send a descent from a position, m, velocity, m/s, and yaw, rad, to a height, m, that goes `aside`, m."""
         loop, (position, velocity, yaw) = self._loop, begin
         rate = loop.mission.rate
-        sinks = descent(position, yaw, -velocity[2], pace, self._floor, lowest, loop.limits, rate, aside)
+        sinks = descent(
+            position, yaw, -velocity[2], pace, self._floor, lowest, limits=loop.limits, rate=rate, aside=aside
+        )
         loop.begin(Stream(sinks, rate))
 
     def _lies(self) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.on_board.program import OnBoardProgram
-from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
+from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Triple
@@ -59,7 +59,7 @@ class Mission:
 def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0) -> Mission:
     """Return the mission that flies these setpoints, with a stop from each of them."""
     stops = encode_stops(encoded.motion, RATE, gains=encoded.gains, space=encoded.space)
-    return Mission(encoded.payloads, stops, limits, encoded.lead, hold_time)
+    return Mission(encoded.payloads, stops, limits, LEAD, hold_time)
 
 
 def manoeuvre_time(distance: float, mean_speed: float) -> float:

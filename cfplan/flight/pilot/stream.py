@@ -2,11 +2,11 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, cast
+from typing import cast
 
 from numpy.typing import NDArray
 
-from cfplan.flight.radio.link import GENERIC_PORT, packet
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.setpoints.commitment import Commitment
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Quaternion, SetpointSent, Triple
@@ -59,9 +59,9 @@ class Stream:
         """Return the number of the setpoint for a time, s, so that a late packet carries the right state."""
         return min(max(self.number(time), self.first), self.last)
 
-    def packet(self, index: int) -> Any:
+    def packet(self, index: int) -> bytes:
         """Return a setpoint as it goes over the radio."""
-        return packet(GENERIC_PORT, 0, self.payloads[index - self.first].tobytes())
+        return pack(Port.SETPOINT, 0, self.payloads[index - self.first].tobytes())
 
     def state(self, index: int) -> State:
         """Return position, velocity, acceleration, quaternion and body rate as the vehicle decodes them."""

@@ -1,3 +1,6 @@
-"""The link to the vehicle: URIs, Crazyradio, lock, connecting, perishable packets, parameters, logs, restart."""
+"""The link to the vehicle: URIs, Crazyradio, lock, connecting, the CRTP session and its transports, restart."""
 
-__all__ = ["connection", "crazyradio", "link", "log_block", "perishable", "restart", "supervisor_bits", "uri"]
+__all__ = [
+    "connection", "crazyradio", "crtp", "dongle", "link", "perishable", "restart", "session", "supervisor_bits",
+    "table", "transport", "uri",
+]  # fmt: skip

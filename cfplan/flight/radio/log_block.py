@@ -1,4 +1,4 @@
-"""Packets that create a log block (CRTP port 5), also in flight, where nothing may wait for an answer.
+"""A block of the vehicle's log (CRTP port 5): packets that create it, also in flight, and its messages.
 
 The firmware deletes all log blocks after 1 s without a packet, and when any client resets the log.
 """
@@ -7,12 +7,15 @@ import itertools
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
-LOG_PORT, SETTINGS_CHANNEL = 5, 1
-_DELETE, _CREATE, _APPEND, _START = 2, 6, 7, 8
+SETTINGS_CHANNEL, DATA_CHANNEL = 1, 2
+DELETE, RESET = 2, 5
+_STOP, _CREATE, _APPEND, _START = 4, 6, 7, 8
 _IN_ONE_PACKET = 9  # variables
 _TICKS_BETWEEN = 30  # from one attempt to the next
-_TYPES = {"uint8_t": 1, "uint16_t": 2, "uint32_t": 3, "int16_t": 5, "float": 7}
+_TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int16_t": (5, "h"), "float": (7, "f")}
+_HEAD = 4  # bytes of a message: number of the block, ms in 24 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,11 +24,11 @@ class LogBlock:
 
     number: int
     period_ms: int
-    variables: tuple[tuple[str, int], ...]  # type in C, and number in the vehicle's table
+    variables: tuple[tuple[str, str, int], ...]  # name, type in C, and number in the vehicle's table
 
     def creation(self) -> tuple[bytes, ...]:
         """Return the payloads that create the block and start it, in order; answers begin with the first two bytes."""
-        entries = [struct.pack("<BH", _TYPES[kind], number) for kind, number in self.variables]
+        entries = [struct.pack("<BH", _TYPES[kind][0], number) for _, kind, number in self.variables]
         parts = [entries[at : at + _IN_ONE_PACKET] for at in range(0, len(entries), _IN_ONE_PACKET)]
         commands = (_CREATE, *(_APPEND for _ in parts[1:]))
         made = tuple(
@@ -38,4 +41,16 @@ class LogBlock:
 
         None stands for a tick without a packet, so that the log has time to come.
         """
-        return itertools.cycle((bytes((_DELETE, self.number)), *self.creation(), *(None,) * _TICKS_BETWEEN))
+        return itertools.cycle((bytes((DELETE, self.number)), *self.creation(), *(None,) * _TICKS_BETWEEN))
+
+    def stop(self) -> bytes:
+        """Return the payload that stops the block."""
+        return bytes((_STOP, self.number))
+
+    def decode(self, message: bytes) -> dict[str, Any] | None:
+        """Return the values of a message by name; None if its length is wrong, as of a block that is half created."""
+        layout = "<" + "".join(_TYPES[kind][1] for _, kind, _ in self.variables)
+        if len(message) != _HEAD + struct.calcsize(layout):
+            return None
+        values = struct.unpack_from(layout, message, _HEAD)
+        return {name: value for (name, _, _), value in zip(self.variables, values, strict=True)}

@@ -1,86 +1,59 @@
-"""Perishable packets: setpoints and poses, which the vehicle takes for fresh whenever they arrive.
+"""Packets that wait for a polled radio; setpoints and poses among them perish, as a vehicle takes them for fresh.
 
-A radio that is dead keeps two packets for when it returns: the one in the air, which cflib's driver repeats until it is
-acknowledged, and the one in its queue. A pose among them throws the vehicle's estimate back by as far as it has come
-since; where no other follows, as poses have stopped too, it flies off to make up for that. So nothing perishable stays
-in either place for long: the queue takes a fresh packet instead, and what is in the air is repeated as an empty packet.
+A Crazyradio repeats the packet in the air until it is acknowledged, and one more waits behind it. A radio that was dead
+would send both when it returns, and an old pose throws the vehicle's estimate back by as far as it has come since.
+So a perishable packet that waits for long gives its place to the next one, and is repeated in the air as an empty one.
 """
 
-import queue
-from array import array
-from collections.abc import Callable
-from typing import Any
+from cfplan.flight.radio.crtp import NULL_PACKET, Port
+from cfplan.flight.setpoints.packets import FULL_STATE_TYPE
 
-from cfplan.flight.setpoints.packets import CRTP_PORT, FULL_STATE_TYPE
-
-LOCALIZATION_PORT, EXTERNAL_POSE = 6, 8
+EXTERNAL_POSE = 8
 KEEPS_FOR = 0.05  # s; under heavy loss a packet is acknowledged sooner
-_COUNTERS = 0x0C  # bits of the header by which cflib and the vehicle tell a new packet from a repeated one
-_EMPTY = 0xF3
 
 
-def is_perishable(header: int, data: bytes) -> bool:
-    """Return whether a packet, by its CRTP header and what follows that, is a full-state setpoint or a pose."""
-    kind = header >> 4, header & 3, data[0] if data else -1
-    return kind in ((CRTP_PORT, 0, FULL_STATE_TYPE), (LOCALIZATION_PORT, 1, EXTERNAL_POSE))
+def is_perishable(packet: bytes) -> bool:
+    """Return whether a packet is a full-state setpoint or a pose."""
+    kind = packet[0] >> 4, packet[0] & 3, packet[1] if len(packet) > 1 else -1
+    return kind in ((Port.SETPOINT, 0, FULL_STATE_TYPE), (Port.LOCALIZATION, 1, EXTERNAL_POSE))
 
 
-class PerishableQueue:
-    """Puts packets of flight into the queue of one of cflib's driver; what has perished there gives way to the next."""
+class Outbox:
+    """The packet in the air and the one that waits behind it, each with the time, s, at which it was put."""
 
-    def __init__(self, waiting: queue.Queue[Any], now: Callable[[], float]):
-        self._waiting, self._now = waiting, now
-        self._last: Any = None  # the last perishable packet that was put
-        self._put_at = 0.0  # s
+    def __init__(self) -> None:
+        self._in_air: tuple[float, bytes] | None = None
+        self._waiting: tuple[float, bytes] | None = None
 
-    def put(self, packet: Any, patience: float) -> None:
-        """Wait for room for at most `patience`, s; then drop the packet, as the next one is fresher."""
-        if not self._replaces(packet):
-            try:
-                self._waiting.put(packet, timeout=patience)
-            except queue.Full:
-                return
-        perishable = is_perishable(packet.header, bytes(packet.data))
-        self._last, self._put_at = (packet if perishable else None), self._now()
+    @property
+    def empty(self) -> bool:
+        """Return whether nothing is in the air."""
+        return self._in_air is None
 
-    def _replaces(self, packet: Any) -> bool:
-        """Put a packet where the last one still waits and has perished; return whether that was so."""
-        if self._last is None or self._now() - self._put_at < KEEPS_FOR:
+    def put(self, packet: bytes, now: float) -> bool:
+        """Take a packet for the air or to wait; return False if a packet waits that is still worth sending."""
+        if self._in_air is None:
+            self._in_air = now, packet
+        elif self._waiting is None or _perished(*self._waiting, now):
+            self._waiting = now, packet
+        else:
             return False
-        with self._waiting.mutex:
-            held = self._waiting.queue
-            if not held or held[0] is not self._last:
-                return False
-            held[0] = packet
         return True
 
+    def transmission(self, now: float) -> bytes:
+        """Return the packet to transmit: the one in the air, or an empty one, which is in the air from then on."""
+        if self._in_air is None:
+            self._in_air = now, NULL_PACKET
+        return NULL_PACKET if _perished(*self._in_air, now) else self._in_air[1]
 
-class PerishableAir:
-    """The dongle as cflib's driver thread sees it: it repeats what has perished in the air as an empty packet.
+    def acknowledged(self) -> None:
+        """Remove the packet in the air: the vehicle has it."""
+        self._in_air, self._waiting = self._waiting, None
 
-    The counters of the header stay: a vehicle that had the packet, whose acknowledgement was lost, sees a repetition.
-    """
-
-    def __init__(self, radio: Any, now: Callable[[], float]):
-        self._radio, self._now = radio, now
-        self._sent: Any = None  # the thread repeats the same array
-        self._since = 0.0  # s
-
-    def send_packet(self, data: Any) -> Any:
-        """Transmit a packet once; return the acknowledgement."""
-        now = self._now()
-        if data is not self._sent:
-            self._sent, self._since = data, now
-        elif now - self._since > KEEPS_FOR and is_perishable(data[0], bytes(data[1:2])):
-            data = array("B", [_EMPTY | data[0] & _COUNTERS])
-        return self._radio.send_packet(data)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._radio, name)
+    def full(self, now: float) -> bool:
+        """Return whether `put` would return False."""
+        return self._waiting is not None and not _perished(*self._waiting, now)
 
 
-def empty_air(driver: Any, now: Callable[[], float]) -> None:
-    """Let a radio driver of cflib repeat perishable packets no longer than they keep; others are left as they are."""
-    thread: Any = getattr(driver, "_thread", None)
-    if thread is not None and hasattr(thread, "_radio"):
-        thread._radio = PerishableAir(thread._radio, now)
+def _perished(put_at: float, packet: bytes, now: float) -> bool:
+    return now - put_at > KEEPS_FOR and is_perishable(packet)

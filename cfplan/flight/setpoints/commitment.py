@@ -1,8 +1,13 @@
-"""Commitment: all that a pilot is bound to fly, which ends at rest inside the space; and how a new plan replaces it.
+"""Commitment: the setpoints that a pilot is bound to fly, which end at rest in the space; proposals replace its end.
 
-Setpoints are numbered from the start of the stream. A proposal continues a commitment from a splice ahead of the clock:
-its first setpoint is the committed one with that number, and all after it replaces what was committed. Who proposes may
-be late, mistaken or broken, so the pilot verifies by itself, without trusting anybody, that
+Setpoints are numbered from the start of the stream. A proposal continues a commitment from a splice, the number of a
+setpoint ahead of the clock; the joint is the moment of the motion at which that setpoint was sampled.
+
+    before the joint   setpoints and their stops stay as they were committed, to the byte
+    at the joint       the proposal's first setpoint is the committed one, within a quantum, so nothing jumps
+    behind the joint   the setpoints and stops of the proposal replace all that was committed
+
+The planner may be late, mistaken or broken, so the pilot verifies by the bytes alone that
 
 - the bytes are those that were certified (checksum), and were made for just this commitment (order);
 - the splice is still ahead of the clock (time), and not farther than a minute;
@@ -11,7 +16,7 @@ be late, mistaken or broken, so the pilot verifies by itself, without trusting a
 - from setpoint to setpoint the vehicle moves as the velocities say (motion), inside the space (space), within the
   limits of plans, and in stops within those of stops (limits).
 
-Where anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
+If anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
 """
 
 import struct
@@ -25,9 +30,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import ATTITUDE_QUANTUM, RATE, controller_attitude
+from cfplan.flight.setpoints.encoding import RATE, controller_attitude
 from cfplan.flight.setpoints.motion_certificate import SPAN, MotionExtremes, excess_of, motion_extremes
-from cfplan.flight.setpoints.packets import FULL_STATE_TYPE, PAYLOAD_SIZE, FullStateSetpoints, decode, positions_of
+from cfplan.flight.setpoints.packets import (
+    ATTITUDE_QUANTUM,
+    FULL_STATE_TYPE,
+    PAYLOAD_SIZE,
+    FullStateSetpoints,
+    decode,
+    positions_of,
+)
 from cfplan.flight.setpoints.rate_trade import turns_for
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
@@ -91,7 +103,7 @@ class Commitment:
     payloads: NDArray  # (N, 29) uint8
     stops: NDArray  # (N, M, 29) uint8
     splices: tuple[int, ...] = ()  # numbers of the setpoints from which plans made in the air are flown
-    checksum: int = -1  # of all that came together to it; of the arrays where it is not given
+    checksum: int = -1  # of it and of all proposals that it was spliced from; -1: to be computed of the arrays
 
     def __post_init__(self) -> None:
         if wrong := _wrong_shape(self.first, self.payloads, self.stops):
@@ -122,18 +134,18 @@ class Proposal:
     payloads: NDArray  # (K, 29) uint8
     stops: NDArray  # (K, M, 29) uint8
     checksum: int  # of splice, payloads and stops
-    ending: int = 0  # how many of the stops, the last ones, are what is left of the stop before them: see left_of()
-    goes_on: bool = False  # whether it is the next part of the plan that is flown, of which nothing need be said
+    ending: int = 0  # number of stops, the last ones, that are only the rest of the stop before them: see left_of()
+    goes_on: bool = False  # whether it is the next part of the plan that is being flown, which needs no message
 
     def to_bytes(self) -> bytes:
-        """Return the proposal as it goes from process to process, where memory that is copied costs milliseconds."""
+        """Return the proposal as a message to the pilot's process; copied memory costs milliseconds, so it is short."""
         sent = len(self.stops) - self.ending
         head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent, self.goes_on)
         return b"".join((head, self.payloads.tobytes(), self.stops[:sent].tobytes()))
 
     @classmethod
     def of_bytes(cls, message: bytes) -> "Proposal | None":
-        """Return the proposal of a message, None where it is none. What it proposes may still be anything."""
+        """Return the proposal of a message, or None if it is none. What it proposes is not verified."""
         if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
             return None
         _, follows, checksum, first, count, length, sent, goes_on = _HEAD.unpack_from(message)
@@ -159,8 +171,8 @@ def propose(
 ) -> Proposal:
     """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on.
 
-    `ending` is how many of the stops, the last ones, are what is left of the stop before them. What `goes_on` is the
-    next part of the plan that is flown.
+    `ending` is the number of stops, the last ones, that are only the rest of the stop before them. With `goes_on`, the
+    proposal is the next part of the plan that is being flown.
     """
     checksum = checksum_of(splice, payloads, stops)
     return Proposal(commitment.checksum, splice, payloads, stops, checksum, ending, goes_on)

@@ -1,11 +1,11 @@
-"""Down by setpoints: landings, gentle with poses and quick without, and stops that sink besides.
+"""Descents as setpoints: landings, gentle with poses and quick without, and stops that also sink.
 
-A descent goes on beneath the floor. A vehicle that stands on the floor, wherever that really is, no longer follows its
-setpoints down, and so the pilot knows that it stands. Roll and pitch rates are small, for a vehicle that is left alone:
-it levels out, leans away from a wall nearby, and comes down where it is.
+A descent continues beneath the floor. A vehicle that stands on the floor, whose height is only roughly known, no longer
+follows its setpoints down: so the pilot detects that it stands. Roll and pitch rates are small; if setpoints stop, the
+vehicle levels out, leans away from a wall nearby, and comes down where it is.
 
-Without poses the vehicle drifts, and as it sinks it goes off the walls nearby. It is to have done so before it touches
-the floor, where a motion sideways would tip it over, so it goes only as far as its time allows.
+Without poses the vehicle drifts, so as it sinks it also moves away from the walls nearby. That must be over before it
+touches the floor, where sideways motion would tip it over, so it moves only as far as its time allows.
 """
 
 import math
@@ -69,6 +69,7 @@ def descent(
     pace: Pace,
     floor: float,
     lowest: float,
+    *,  # beside the motion itself: what it is flown by
     limits: Limits,
     rate: float,
     aside: tuple[float, float] = (0.0, 0.0),
@@ -127,11 +128,11 @@ def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, 
     duration, length = max(within, 1) / rate, math.hypot(*aside)
     reach = acceleration * duration**2 / _BY_SMOOTHSTEP if within else 0.0
     way = np.array(aside) * (min(1.0, reach / length) if length > 0.0 else 0.0)
-    share = np.minimum(np.arange(count)[:, None] / max(within, 1), 1.0)
+    fraction = np.minimum(np.arange(count)[:, None] / max(within, 1), 1.0)
     return (
-        share**3 * (10.0 - 15.0 * share + 6.0 * share**2) * way,
-        30.0 * share**2 * (1.0 - share) ** 2 / duration * way,
-        60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / duration**2 * way,
+        fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2) * way,
+        30.0 * fraction**2 * (1.0 - fraction) ** 2 / duration * way,
+        60.0 * fraction * (1.0 - fraction) * (1.0 - 2.0 * fraction) / duration**2 * way,
     )
 
 

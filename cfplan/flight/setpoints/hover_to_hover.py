@@ -1,7 +1,7 @@
 """Hover to hover by setpoints: up to the height of take-off, and to the start of a plan.
 
 While setpoints come, the vehicle's own time-outs watch over it: it levels out when they stop, and stops its motors
-2 s later. In the hands of its on-board commander it would hover on without poses, and drift.
+2 s later. Under the firmware's own high-level commander it would hover on without poses, and drift.
 """
 
 import math
@@ -22,12 +22,12 @@ def hover_to_hover(
 
     So slow a motion leans and rolls too little to be worth roll and pitch rates.
     """
-    share = np.linspace(0.0, 1.0, max(round(duration * rate), 1) + 1)
-    along = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    speed = 30.0 * share**2 * (1.0 - share) ** 2 / duration
-    change = 60.0 * share * (1.0 - share) * (1.0 - 2.0 * share) / duration**2
+    fraction = np.linspace(0.0, 1.0, max(round(duration * rate), 1) + 1)
+    along = fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
+    speed = 30.0 * fraction**2 * (1.0 - fraction) ** 2 / duration
+    change = 60.0 * fraction * (1.0 - fraction) * (1.0 - 2.0 * fraction) / duration**2
     way, turn = np.subtract(end, begin), math.remainder(end_yaw - yaw, math.tau)
-    zero = np.zeros_like(share)
+    zero = np.zeros_like(fraction)
     acceleration = change[:, None] * way
     leaning = controller_attitude(acceleration + np.array([0.0, 0.0, GRAVITY]), about_z(yaw + turn * along))
     return FullStateSetpoints(

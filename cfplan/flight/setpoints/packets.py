@@ -18,6 +18,8 @@ from cfplan.machine_code import njit
 
 CRTP_PORT = 7
 FULL_STATE_TYPE = 6
+HALF_QUANTUM = 0.5e-3  # of position m, velocity m/s, acceleration m/s², body rate rad/s
+ATTITUDE_QUANTUM = math.radians(0.25)  # the largest angle by which compressing turns a quaternion
 LARGEST = 32.767  # the largest value that 16 bits hold, in m, m/s, m/s² or rad/s
 
 _WIRE_OF_ONE = Struct("<B9hI3h")
@@ -39,21 +41,22 @@ class FullStateSetpoints:
     body_rate: NDArray  # (N, 3) rad/s, body axes
 
 
-def encode(setpoints: FullStateSetpoints, first: int = 0) -> NDArray:
-    """Return the payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit.
+def arrays_of(setpoints: FullStateSetpoints) -> tuple[NDArray, ...]:
+    """Return the fields in their order, as arrays of one type for compiled code."""
+    return tuple(np.array(getattr(setpoints, name), dtype=float, order="C") for name in FullStateSetpoints.__slots__)
 
-    `first` is the number of the first setpoint, for the error's text.
-    """
-    compressed = compress_quaternion(setpoints.quaternion, first)
+
+def encode(setpoints: FullStateSetpoints) -> NDArray:
+    """Return the payloads, (N, 29) uint8. Raises NotCertifiedError where a value is not finite or does not fit."""
+    compressed = compress_quaternion(setpoints.quaternion)
     payloads = np.empty((len(compressed), PAYLOAD_SIZE), dtype=np.uint8)
-    position, velocity, acceleration, rate = values = [
-        np.array(getattr(setpoints, name), dtype=float, order="C") for name in _IN_MILLI
-    ]
-    bad, field = _packed(payloads, (position, velocity, acceleration, rate), compressed)
+    position, velocity, acceleration, _, rate = arrays_of(setpoints)
+    values = position, velocity, acceleration, rate
+    bad, field = _packed(payloads, values, compressed)
     if bad >= 0:
         raise NotCertifiedError(
             f"{_IN_MILLI[field]} {values[field][bad]} does not fit a packet (at most {LARGEST})",
-            where=f"setpoint {first + bad}",
+            where=f"setpoint {bad}",
             hint="keep the flight within that of the room's origin, and its limits below that",
         )
     return payloads
@@ -83,7 +86,7 @@ def decode_one(payload: bytes) -> list[float]:
     return [*(value / 1000.0 for value in milli), *turn, roll / 1000.0, pitch / 1000.0, yaw / 1000.0]
 
 
-def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
+def compress_quaternion(quaternion: NDArray) -> NDArray:
     """Compress (N, 4) x y z w, not zero, to (N,) u32.
 
     2 bits name the largest component, 3 × (sign, 9 bits) give the others.
@@ -91,7 +94,7 @@ def compress_quaternion(quaternion: NDArray, first: int = 0) -> NDArray:
     compressed, bad = _compressed(np.array(quaternion, dtype=float))
     if bad >= 0:
         raise NotCertifiedError(
-            "the quaternion is zero or not finite", where=f"setpoint {first + bad}", hint="plan the trajectory anew"
+            "the quaternion is zero or not finite", where=f"setpoint {bad}", hint="plan the trajectory anew"
         )
     return compressed
 

@@ -1,8 +1,8 @@
-"""The certificate of the stops: the motion that their bytes make the vehicle fly, held against the limits.
+"""Stop certificate: the worst values of the motion that the bytes of stops make the vehicle fly, against their limits.
 
 A stop may exceed the limits of the plan: where a turn is flown at its limit, braking adds to it. Longer stops gain
-little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and must keep what the table of quantities says
-that a stop may reach: the limits of the flight, a tilt at which the controller is stable, the thrust of the motors.
+little (5.7 m/s² instead of 5.8 for twice the way), so all are short, and have limits of their own in the table of
+quantities: the limits of the flight, a tilt at which the controller is stable, the thrust of the motors.
 """
 
 import math
@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.setpoints.encoding import check_motion, encode_motion
+from cfplan.flight.setpoints.byte_check import check_motion
+from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains
 from cfplan.flight.setpoints.stops import DURATION, chunks, stop_motion
@@ -58,6 +59,7 @@ def certify_stops(
     motion: FullStateSetpoints,
     limits: Limits,
     rate: float,
+    *,  # as for encode_stops()
     rows: NDArray | None = None,
     gains: AttitudeGains = FIRMWARE_GAINS,
     space: Space | None = None,
@@ -71,7 +73,8 @@ def certify_stops(
     measured = []
     for some in chunks(len(stops)):
         made = stop_motion(motion, begin[some], rate, duration)
-        measured.append(_measured(stops[some], made, begin, some.start, limits, rate, gains, space))
+        flown = _flown(stops[some], made, begin[some], gains, space)
+        measured.append(_worst(flown, stops.shape[1], limits.airframe, rate))
     return _certificate(np.concatenate(measured, axis=1), limits)
 
 
@@ -86,9 +89,7 @@ def encode_certified_stops(
 ) -> tuple[NDArray, StopCertificate]:
     """Return a stop from each row of a motion as encode_stops() does, and their certificate, in less time than both.
 
-    `count` is of how many rows, from the first on; of all where it is not given.
-
-    Raises NotCertifiedError as certify_stops() does.
+    With `count`, only stops from the first `count` rows are made. Raises NotCertifiedError as certify_stops() does.
     """
     count, length = len(motion.position) if count is None else count, round(DURATION * rate) + 1
     begin = np.arange(min(_resting_from(motion) + 1, count))  # those behind are the same
@@ -96,7 +97,8 @@ def encode_certified_stops(
     for some in chunks(len(begin)):
         made = stop_motion(motion, begin[some], rate, DURATION)
         stops[some] = encode_motion(*made, gains, space=space).reshape(-1, length, PAYLOAD_SIZE)
-        measured.append(_measured(stops[some], made, begin, some.start, limits, rate, gains, space))
+        flown = _flown(stops[some], made, begin[some], gains, space)
+        measured.append(_worst(flown, length, limits.airframe, rate))
     stops[len(begin) :] = stops[begin[-1]]
     measured.append(np.repeat(measured[-1][:, -1:], count - len(begin), axis=1))
     return stops, _certificate(np.concatenate(measured, axis=1), limits)
@@ -111,28 +113,19 @@ def _resting_from(motion: FullStateSetpoints) -> int:
     return int(np.flatnonzero(changes).max(initial=0))
 
 
-def _measured(
-    stops: NDArray,
-    made: tuple[FullStateSetpoints, NDArray],
-    begin: NDArray,
-    first: int,
-    limits: Limits,
-    rate: float,
-    gains: AttitudeGains,
-    space: Space | None,
-) -> NDArray:
-    """Return (len(BOUND), K) worst values of K stops, which are to fly what was made of them; `first` is their number.
+def _flown(
+    stops: NDArray, made: tuple[FullStateSetpoints, NDArray], begin: NDArray, gains: AttitudeGains, space: Space | None
+) -> FullStateSetpoints:
+    """Return the motion that stops, (K, M, 29), make; `made` is what they are to fly, from the rows `begin`, (K,).
 
     Raises NotCertifiedError where their bytes do not make the vehicle fly that.
     """
-    length = stops.shape[1]
     try:
-        flown = check_motion(stops.reshape(-1, PAYLOAD_SIZE), *made, gains, first * length, space=space)
+        return check_motion(stops.reshape(-1, PAYLOAD_SIZE), *made, gains, space=space)
     except NotCertifiedError as error:
-        number = int(error.where.split()[-1])
-        where = f"setpoint {number % length} of the stop from {begin[number // length]}"
+        stop, row = divmod(int(error.where.split()[-1]), stops.shape[1])
+        where = f"setpoint {row} of the stop from {begin[stop]}"
         raise NotCertifiedError(error.what, where=where, hint=error.hint) from None
-    return _worst(flown, length, limits.airframe, rate)
 
 
 def _certificate(worst: NDArray, limits: Limits) -> StopCertificate:

@@ -17,22 +17,23 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.flight.setpoints.encoding import (
-    LEADING_SHARE,
+    LEADING_WEIGHT,
     RATE_LEAD,
     THRUST_LEAD,
+    attitude_rows,
     command_quaternion,
     encode_motion,
 )
-from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints
+from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, arrays_of
 from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ahead
 from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import write_quaternion, yaw_of
+from cfplan.vehicle.rotations import quaternion_of, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
-_CHUNK = 200  # stops at a time, so that all fields of them stay in a processor's cache
+_CHUNK = 64  # stops at a time, so that all fields of them stay in a processor's cache
 
 
 def encode_stops(
@@ -88,29 +89,21 @@ def stop_motion(
     vector have the leads, s, of the setpoints of a plan.
     """
     steps = round(duration * rate)
-    share = np.arange(steps + 1) / steps
-    clock_rate = 1.0 - share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
-    slowing = -30.0 * share**2 * (1.0 - share) ** 2 / duration
-    elapsed = share - 2.5 * share**4 + 3.0 * share**5 - share**6  # the integral of clock_rate
+    fraction = np.arange(steps + 1) / steps
+    clock_rate = 1.0 - fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
+    slowing = -30.0 * fraction**2 * (1.0 - fraction) ** 2 / duration
+    elapsed = fraction - 2.5 * fraction**4 + 3.0 * fraction**5 - fraction**6  # the integral of clock_rate
     elapsed *= duration * rate  # in setpoints
     yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
-    position, velocity, sent, attitude, body_rate, acceleration = _stop_rows(
-        np.array(motion.position, dtype=float, order="C"),  # one type for the compiler
-        np.array(motion.velocity, dtype=float, order="C"),
-        np.array(motion.acceleration, dtype=float, order="C"),
+    *fields, acceleration = _stop_rows(
+        arrays_of(motion),
         np.array(yaw, dtype=float),
         np.array(begin, dtype=np.int64),
         np.stack([elapsed, clock_rate, slowing]),
         rate,
         np.array([rate_lead * rate, thrust_lead * rate]),
     )
-    stops = FullStateSetpoints(
-        position=position.reshape(-1, 3),
-        velocity=velocity.reshape(-1, 3),
-        acceleration=sent.reshape(-1, 3),
-        quaternion=attitude.reshape(-1, 4),
-        body_rate=body_rate.reshape(-1, 3),
-    )
+    stops = FullStateSetpoints(*(field.reshape(-1, field.shape[-1]) for field in fields))
     return stops, ahead(acceleration, rate).reshape(-1, 3)
 
 
@@ -119,28 +112,21 @@ _Rows = tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]
 
 @njit(error_model="numpy", nogil=True)
 def _stop_rows(
-    position: NDArray,
-    velocity: NDArray,
-    acceleration: NDArray,
-    yaw: NDArray,
-    begin: NDArray,
-    clock: NDArray,
-    rate: float,
-    leads: NDArray,
+    motion: tuple[NDArray, ...], yaw: NDArray, begin: NDArray, clock: NDArray, rate: float, leads: NDArray
 ) -> _Rows:
     """Return position, velocity, acceleration as sent, attitude, body rate, and acceleration, (K, M, …), of K stops.
 
-    The motion has N rows; `clock`, (3, M), is its time elapsed, in rows, its rate and how that falls, 1/s; the `leads`
-    of rates and of thrust are in rows.
+    `motion` are the fields of N setpoints, and `yaw`, (N,) rad, is the one that the controller reads from each.
+    `clock`, (3, M), is the time elapsed along the motion, in rows, its rate, and how that rate changes, 1/s. `leads`
+    are those of rates and of thrust, in rows.
     """
+    position, velocity, acceleration, _, _ = motion
     count, stops, length = len(position), len(begin), clock.shape[1]
     places, speeds, sent, made, rates = (
         np.empty((stops, length, 3)), np.empty((stops, length, 3)), np.empty((stops, length, 3)),
         np.empty((stops, length, 3)), np.empty((stops, length, 3)),
     )  # fmt: skip
-    attitudes, thrust, turning, matrix = (
-        np.empty((stops, length, 4)), np.empty(length), np.empty((length, 3)), np.empty((3, 3)),
-    )  # fmt: skip
+    attitudes, thrust, turning = np.empty((stops, length, 4)), np.empty(length), np.empty((length, 3))
     for k in range(stops):
         for m in range(length):
             place = min(begin[k] + clock[0, m], count - 1.0)
@@ -153,15 +139,17 @@ def _stop_rows(
                 speeds[k, m, i] = clock[1, m] * speed
                 made[k, m, i] = clock[1, m] ** 2 * along + clock[2, m] * speed
             turn = yaw[row] + between * (yaw[after] - yaw[row])
-            thrust[m] = _write_attitude(matrix, made[k, m], math.cos(turn), math.sin(turn))
-            write_quaternion(attitudes[k, m], matrix)
+            a, b, c = made[k, m, 0], made[k, m, 1], made[k, m, 2] + GRAVITY
+            thrust[m] = math.sqrt(a * a + b * b + c * c)
+            attitude = quaternion_of(attitude_rows((a, b, c), (math.cos(turn), math.sin(turn))))
+            attitudes[k, m, 0], attitudes[k, m, 1], attitudes[k, m, 2], attitudes[k, m, 3] = attitude
         for m in range(length):
             periods = 1.0 if m == 0 or m == length - 1 else 2.0
             _write_turn(turning[m], attitudes[k, max(m - 1, 0)], attitudes[k, min(m + 1, length - 1)], rate / periods)
         for m in range(length):
             for i in range(3):
                 later, before = _between(turning, m + leads[0], i), _between(turning, m - leads[0], i)
-                rates[k, m, i] = LEADING_SHARE * later + (1.0 - LEADING_SHARE) * before
+                rates[k, m, i] = LEADING_WEIGHT * later + (1.0 - LEADING_WEIGHT) * before
             place = min(m + leads[1], length - 1.0)
             row = int(place)
             after, between = min(row + 1, length - 1), place - row
@@ -182,21 +170,6 @@ def _between(values: NDArray, place: float, column: int) -> float:
 
 
 @register_jitable
-def _write_attitude(out: NDArray, acceleration: NDArray, cos: float, sin: float) -> float:
-    """Write the controller's attitude, (3, 3), of an acceleration and a yaw; return the specific thrust, m/s²."""
-    a, b, c = acceleration[0], acceleration[1], acceleration[2] + GRAVITY
-    thrust = math.sqrt(a * a + b * b + c * c)
-    a, b, c = a / thrust, b / thrust, c / thrust
-    p, q, r = -c * sin, c * cos, a * sin - b * cos
-    norm = math.sqrt(p * p + q * q + r * r)
-    p, q, r = p / norm, q / norm, r / norm
-    out[0, 0], out[1, 0], out[2, 0] = q * c - r * b, r * a - p * c, p * b - q * a
-    out[0, 1], out[1, 1], out[2, 1] = p, q, r
-    out[0, 2], out[1, 2], out[2, 2] = a, b, c
-    return thrust
-
-
-@register_jitable
 def _write_turn(out: NDArray, before: NDArray, after: NDArray, rate: float) -> None:
     """Write the turn, (3,), from one attitude to another, (4,) each, times a rate."""
     x0, y0, z0, w0 = before[0], before[1], before[2], before[3]
@@ -209,11 +182,3 @@ def _write_turn(out: NDArray, before: NDArray, after: NDArray, rate: float) -> N
     angle = 2.0 * math.atan2(sine, abs(scalar))
     scale = (-angle if scalar < 0.0 else angle) / max(sine, 1e-12) * rate
     out[0], out[1], out[2] = x * scale, y * scale, z * scale
-
-
-def _ahead(values: NDArray, by: float) -> NDArray:
-    """Return (..., M, K): the rows `by` rows later on, or before; the first and the last hold."""
-    place = np.clip(np.arange(values.shape[-2]) + by, 0.0, values.shape[-2] - 1.0)
-    row = place.astype(int)
-    after = np.minimum(row + 1, values.shape[-2] - 1)
-    return values[..., row, :] + (place - row)[:, None] * (values[..., after, :] - values[..., row, :])

@@ -100,7 +100,7 @@ def plan_convex(task: PlanningTask) -> Solution:
 def _boundary(task: PlanningTask) -> Boundary:
     """Return b at the path's ends: 0 at a rest end, None where it is free."""
     values = []
-    for s, state in ((0.0, task.start), (task.path.end, task.end)):
+    for s, state in ((0.0, task.start), (task.path.end, None)):
         square = float(np.sum(task.path(np.array([s]), 1) ** 2))
         values.append(0.0 if square == 0.0 else None if state is None else state.h * square)
     return values[0], values[1]
@@ -116,7 +116,7 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
             raise InfeasibleError(
                 f"a boundary state of {value**0.5:.3f} m/s is faster than the limits allow there, "
                 f"{ceiling[index] ** 0.5:.3f} m/s",
-                where=f"{'start' if index == 0 else 'end'} of the path",
+                where="start of the path",
                 hint="start slower, or loosen the limits",
             )
         ceiling[index] = max(value, 1e-9)  # the library wants it positive

@@ -145,9 +145,8 @@ def program_bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str,
         rows_low[0, 10] = rows_high[0, 10] = 0.0
     else:
         low[0, 4], low[0, 5], rows_low[0, 11] = 0.0, 0.0, 0.0  # z ≥ 0, w ≥ 0 and z ≤ w: yaw in [0, π/2]
-    for index, state in ((0, task.start), (-1, task.end)):
-        if state is not None:
-            low[index, :2] = high[index, :2] = (state.h, state.dh)
+    if task.start is not None:
+        low[0, :2] = high[0, :2] = (task.start.h, task.start.dh)
     steps = np.zeros((count - 1) * STEP_ROWS)
     return {
         "lbx": low.ravel(),

@@ -134,10 +134,10 @@ def segment_of(task: PlanningTask, nodes: int) -> Segment:
     """Return the first `nodes` intervals of a task; their end is free unless they are all of it."""
     whole, step = nodes == task.nodes, task.path.end / task.nodes
     path = task.path if whole else task.path.part(0.0, nodes * step)
-    yaw = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle, task.start, task.end)
+    yaw = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle, task.start)
     shape = Shape(nodes, task.yaw is YawMode.FREE, task.limits.angular_acceleration < math.inf, (3, 3 * whole))
     return Segment(
-        path, task.airframe, task.limits, Ends(task.start, task.end if whole else None), yaw.part(0, nodes),
+        path, task.airframe, task.limits, Ends(task.start), yaw.part(0, nodes),
         layout_of(shape),
         task.speed_caps and task.speed_caps.part(0.0, path.end),
         slowness_of(guess_spline(path, task.airframe, task.limits, nodes), task.limits),
@@ -314,15 +314,14 @@ def _given(task: PlanningTask, profile: SpeedProfile) -> tuple[Segment, NDArray]
     path, limits, nodes = task.path, task.limits, len(profile.s) - 1
     free, step = task.yaw is YawMode.FREE, task.path.end / nodes
     layout = layout_of(Shape(nodes, free, turning_limited=limits.angular_acceleration < math.inf))
-    ends, yaw = Ends(task.start, task.end), YawSpline.of(profile)
+    ends, yaw = Ends(task.start), YawSpline.of(profile)
     whole = Segment(path, task.airframe, limits, ends, yaw, layout, task.speed_caps, slowness_of(profile.h, limits))
     near = np.maximum(h_coefficients(profile) / whole.unit, TUNING.floor)
-    near = led_into(near, whole.unit, step, task.start, task.end)[:, None]
+    near = led_into(near, whole.unit, step, task.start)[:, None]
     if free:
         near = np.column_stack([near, np.append(yaw.coefficients(step), 0.0)])
-        for state, rows in ((task.start, near[:2]), (task.end, near[-3:-1])):
-            if state:
-                rows[:, 1] = end_coefficients(state.yaw, state.dyaw * step)
+        if task.start:
+            near[:2, 1] = end_coefficients(task.start.yaw, task.start.dyaw * step)
     return whole, near
 
 

@@ -1,4 +1,4 @@
-"""Initial guesses of speed profiles: slow enough everywhere, smooth, and blended into boundary states."""
+"""Initial guesses of speed profiles: slow enough everywhere, smooth, and blended into a boundary state."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,81 +27,61 @@ def guess(
     *,
     unit: float,
     start: BoundaryState | None,
-    end: BoundaryState | None,
     yaw: float | None,
 ) -> NDArray:
     """Return (N+3, 1 or 2) spline coefficients: of h over its `unit`, and of yaw.
 
-    `yaw` is the initial yaw if no state gives one; None: no yaw is guessed.
+    `yaw` is the initial yaw if the start does not give it; None: no yaw is guessed.
     """
     step = path.end / nodes
-    cubic = led_into(guess_spline(path, airframe, limits, nodes) / unit, unit, step, start, end)
+    cubic = led_into(guess_spline(path, airframe, limits, nodes) / unit, unit, step, start)
     if yaw is None:
         return cubic[:, None]
-    return np.stack([cubic, np.append(_yaw(start, end, yaw, nodes, step), 0.0)], axis=1)
+    return np.stack([cubic, np.append(_yaw(start, yaw, nodes, step), 0.0)], axis=1)
 
 
-def led_into(
-    coefficients: NDArray, unit: float, step: float, start: BoundaryState | None, end: BoundaryState | None
-) -> NDArray:
-    """Change (N+3,) coefficients of h over its `unit` so that they meet the boundary states and leave them smoothly.
+def led_into(coefficients: NDArray, unit: float, step: float, start: BoundaryState | None) -> NDArray:
+    """Change (N+3,) coefficients of h over its `unit` so that they begin in the boundary state and leave it smoothly.
 
     The given coefficients must be positive; `step` is the length of an interval in s.
     """
-    led, held = coefficients.copy(), []
-    for state, here, there in ((start, led, coefficients), (end, led[::-1], coefficients[::-1])):
-        if state:
-            turned = 1.0 if state is start else -1.0
-            first = node_coefficients(state.h / unit, turned * state.dh * step / unit, state.ddh * step**2 / unit)
-            if min(first) > 0:
-                here[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(there[1:3]), len(led) - 1, bool(start and end)))
-            held.append((here, first))
-    for here, first in held:  # both are blended in before either is fixed
-        here[:3] = first
+    led = coefficients.copy()
+    if start:
+        first = node_coefficients(start.h / unit, start.dh * step / unit, start.ddh * step**2 / unit)
+        if min(first) > 0:
+            led[1:] *= np.exp(_leave(np.log(first[1:]) - np.log(led[1:3]), len(led) - 1))
+        led[:3] = first
     return led
 
 
-def _leave(offsets: NDArray, count: int, held: bool) -> NDArray:
-    """Return (count,): from two offsets smoothly to zero, exactly zero at the other end if that is held too."""
+def _leave(offsets: NDArray, count: int) -> NDArray:
+    """Return (count,): from two offsets smoothly to zero."""
     x = np.arange(count) - 1.0
     last, slope = offsets[1], offsets[1] - offsets[0]
-    left = np.clip(1.0 - x / (count - 2 - 2 * held), 0.0, 1.0)
+    left = np.clip(1.0 - x / (count - 2), 0.0, 1.0)
     return (last + x * (slope + last / _G.h_blend)) * np.exp(-x / _G.h_blend) * left**2 * (3.0 - 2.0 * left)
 
 
-def _yaw(start: BoundaryState | None, end: BoundaryState | None, yaw: float, nodes: int, step: float) -> NDArray:
-    """Return (N+2,) coefficients of yaw: decaying turns out of one state and into the other, blended in between."""
-
-    def turned(state: BoundaryState, distance: NDArray, towards: float) -> NDArray:
-        faded = _G.yaw_blend * np.sign(distance) * (1.0 - np.exp(-np.abs(distance) / _G.yaw_blend))
-        return state.yaw + towards * state.dyaw * step * faded
-
-    x = np.arange(nodes + 2) - 0.5
-    spline = turned(start, x, 1.0) if start else np.full(nodes + 2, yaw)
-    if end:
-        share = np.clip(x / nodes, 0.0, 1.0)
-        spline += (turned(end, nodes - x, -1.0) - spline) * share**2 * (3.0 - 2.0 * share)
-        spline[-2:] = end_coefficients(end.yaw, end.dyaw * step)
-    if start:
-        spline[:2] = end_coefficients(start.yaw, start.dyaw * step)
-    return spline
+def _yaw(start: BoundaryState | None, yaw: float, nodes: int, step: float) -> NDArray:
+    """Return (N+2,) coefficients of yaw: a turn that decays after the start."""
+    if not start:
+        return np.full(nodes + 2, yaw)
+    faded = _G.yaw_blend * (1.0 - np.exp(-(np.arange(nodes + 2) - 0.5) / _G.yaw_blend))
+    spline = start.yaw + start.dyaw * step * faded
+    spline[:2] = end_coefficients(start.yaw, start.dyaw * step)
+    return np.asarray(spline)
 
 
-def lowered(coefficients: NDArray, share: float, held: tuple[bool, bool], rate: float) -> NDArray:
-    """Return the coefficients with h lowered by a fraction `share`, less so next to an end held by a boundary state.
+def lowered(coefficients: NDArray, share: float, held: bool, rate: float) -> NDArray:
+    """Return the coefficients with h lowered by a fraction `share`, less so next to a start `held` by a boundary state.
 
     `rate` is how many intervals a second pass where x is 1.
     """
-    result = coefficients.copy()
-    if not any(held):
-        result[:, 0] *= 1.0 - share
-        return result
-    less = np.full(len(coefficients), float(share))
-    for is_held, from_end, x in zip(held, (less, less[::-1]), (coefficients[1, 0], coefficients[-2, 0]), strict=True):
-        if is_held:
-            to = max(_G.lowered_to, int(_G.lowered_time * rate * np.sqrt(max(x, 0.0))))
-            count = min(len(less), to)
-            from_end[:count] *= np.clip((np.arange(count) - _G.lowered_from + 1) / (to - _G.lowered_from + 1), 0.0, 1.0)
+    result, less = coefficients.copy(), np.full(len(coefficients), float(share))
+    if held:
+        to = max(_G.lowered_to, int(_G.lowered_time * rate * np.sqrt(max(coefficients[1, 0], 0.0))))
+        count = min(len(less), to)
+        less[:count] *= np.clip((np.arange(count) - _G.lowered_from + 1) / (to - _G.lowered_from + 1), 0.0, 1.0)
     result[:, 0] *= 1.0 - less
     return result
 

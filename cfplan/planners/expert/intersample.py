@@ -13,9 +13,9 @@ from cfplan.safety import quantities
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.quantities import scaled
 from cfplan.safety.speed_caps import SpeedCaps
-from cfplan.vehicle import dense
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.measures import SPEED
+from cfplan.vehicle.motion import measures_at
 from cfplan.vehicle.profile import SpeedProfile
 
 # Chebyshev-Lobatto: both ends of an interval, and closer together near them
@@ -50,11 +50,9 @@ class DensePath:
         step = path.end / nodes
         refined = turns(path, nodes) > TUNING.sharp
         refined[: TUNING.refined_at_ends] = refined[-TUNING.refined_at_ends :] = True
-        self.allowance, self.begins, self.interval, self.places, s = _laid_out(
-            refined, quantities.JUMPS, _PLACES, _FINE, step
-        )
-        self.derivatives = path.derivatives(s)[1:]
-        self.caps = None if caps is None else caps.at(s)
+        self.allowance, self.begins, self.interval, self.s = _laid_out(refined, quantities.JUMPS, _PLACES, _FINE, step)
+        self.curve = path.derivatives(self.s)
+        self.caps = None if caps is None else caps.at(self.s)
 
     def violation(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> Violation:
         """Return the violation by a profile with the same number of intervals; h must be positive."""
@@ -66,7 +64,7 @@ class DensePath:
 
     def measures(self, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> NDArray:
         """Return the measures at all places, (MEASURES, P · K), speed counted against caps as against the limit."""
-        at = dense.dense_rows(airframe, self.derivatives, profile, self.places, self.interval)
+        at = measures_at(airframe, self.curve, profile.table(), self.s, self.interval)
         _count_against_caps(at, self.caps, limits)
         return at
 
@@ -78,9 +76,9 @@ class DensePath:
 @njit
 def _laid_out(
     refined: NDArray, jumps: NDArray, usual: NDArray, fine: NDArray, step: float
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return the allowance of each interval, (N, MEASURES), and the first place of each, (N+1,); and of each place its
-    interval, how far in s it lies in there, and s: one interval's after another's."""
+    interval and s: one interval's after another's."""
     allowance, begins = np.empty((len(refined), len(jumps))), np.zeros(len(refined) + 1, np.int64)
     for k in range(len(refined)):
         begins[k + 1] = begins[k] + (len(fine) if refined[k] else len(usual))
@@ -88,13 +86,12 @@ def _laid_out(
             allowance[k, row] = (
                 TUNING.fine_allowance if refined[k] else TUNING.thrust_allowance if jumps[row] else TUNING.allowance
             )
-    interval, within, s = np.empty(begins[-1], np.int64), np.empty(begins[-1]), np.empty(begins[-1])
+    interval, s = np.empty(begins[-1], np.int64), np.empty(begins[-1])
     for k in range(len(refined)):
         places = fine if refined[k] else usual
         for n in range(len(places)):
-            at, x = begins[k] + n, step * places[n]
-            interval[at], within[at], s[at] = k, x, step * k + x
-    return allowance, begins, interval, within, s
+            interval[begins[k] + n], s[begins[k] + n] = k, step * (k + places[n])
+    return allowance, begins, interval, s
 
 
 @njit
@@ -132,7 +129,7 @@ def violates_at_nodes(
 ) -> bool:
     """Return whether a limit is exceeded at a node; if none is, the certificate still decides."""
     first, nodes = profile.s[:-1], np.arange(len(profile.s) - 1)
-    at = dense.dense_rows(airframe, path.derivatives(first)[1:], profile, np.zeros(len(first)), nodes)
+    at = measures_at(airframe, path.derivatives(first), profile.table(), first, nodes)
     _count_against_caps(at, None if caps is None else caps.at(first), limits)
     rows = scaled(at, limits).T
     return bool((rows > quantities.UPPER).any() or (rows < quantities.LOWER).any())

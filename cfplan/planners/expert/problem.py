@@ -99,16 +99,16 @@ def layout_of(shape: Shape) -> Layout:
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """Boundary states, None where the end is free."""
+    """How a segment begins, and whether another goes on from it. Its end is free, or at rest where the path is."""
 
-    start: BoundaryState | None
-    end: BoundaryState | None
+    start: BoundaryState | None  # None where it is free
     continues: bool = False  # whether the start is a joint, which another problem's solution crossed with room to spare
     joint: int | None = None  # the interval before which this problem's solution will be cut, for another to go on
 
     @property
-    def held(self) -> tuple[bool, bool]:
-        return self.start is not None, self.end is not None
+    def held(self) -> bool:
+        """Return whether a boundary state decides the start."""
+        return self.start is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,7 +173,7 @@ def build_problem(
 ) -> Problem:
     """Return the problem of a segment. Where yaw is free its first value lies from `yaw_angle` to a quarter turn more.
 
-    `coefficients`, (N+3, 1 or 2), is where the search begins (None: a guess); they must agree with the boundary states.
+    `coefficients`, (N+3, 1 or 2), is where the search begins (None: a guess); they must agree with the boundary state.
     """
     layout, path, limits, ends = segment.layout, segment.path, segment.limits, segment.ends
     nodes = layout.shape.nodes
@@ -185,13 +185,12 @@ def build_problem(
     nominal = np.linalg.norm(path(s, 1), axis=1)
     speed = (1.0 - margin[layout.speed_interval]) * allowed_speed(limits.speed, segment.caps, s)
     highest = np.minimum((speed / np.maximum(nominal, REST)) ** 2 / unit, TUNING.ceiling * segment.slowness**2)
-    for node, boundary in ((0, ends.start), (nodes, ends.end)):
-        if boundary:
-            highest[node] = np.inf  # the state decides, and was checked
+    if ends.held:
+        highest[0] = np.inf  # the state decides, and was checked
     lower, upper = _limits_at_points(layout, ends, margin)
     if coefficients is None:
         coefficients = guess(
-            path, segment.airframe, limits, nodes, unit=unit, start=ends.start, end=ends.end,
+            path, segment.airframe, limits, nodes, unit=unit, start=ends.start,
             yaw=yaw_angle + FREE_START / 2 if layout.shape.free_yaw else None,
         )  # fmt: skip
     return Problem(
@@ -219,7 +218,7 @@ def _point_data(segment: Segment, step: float) -> NDArray:
 
 def _limits_at_points(layout: Layout, ends: Ends, margin: NDArray) -> tuple[NDArray, NDArray]:
     """Return the lower and upper bounds of the rows at points, tightened by the margin of each interval, (N,)."""
-    decided = (layout.s == 0.0) & ends.held[0] | (layout.s == layout.shape.nodes) & ends.held[1]  # by boundary states
+    decided = (layout.s == 0.0) & ends.held  # by the boundary state
     tighter = np.where(
         decided & ~point_constraints.JUMPS[:, None],
         -TUNING.boundary_tolerance,
@@ -282,12 +281,6 @@ def held_by(ends: Ends, nodes: int) -> NDArray:
 
     A state may lie at a limit and nearly determines what follows: there is no room to lower limits there.
     """
-    if not ends.start and not ends.end:
+    if not ends.held or ends.continues:
         return np.zeros(nodes)
-    free = np.ones(nodes)
-    distance = np.arange(nodes) + 0.5
-    if ends.start and not ends.continues:
-        free = np.minimum(free, (distance - 1.5) / TUNING.blend)
-    if ends.end:
-        free = np.minimum(free, (nodes - distance - 1.5) / TUNING.blend)
-    return 1.0 - np.clip(free, 0.0, 1.0)
+    return 1.0 - np.clip((np.arange(nodes) - 1.0) / TUNING.blend, 0.0, 1.0)

@@ -66,8 +66,8 @@ class Variables:
 
 
 @lru_cache(maxsize=128)
-def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, bool]) -> Variables:
-    """Return the variables, where each end is held by a boundary state or not, and at rest or not."""
+def variables_of(layout: Layout, held: bool, rests: tuple[bool, bool]) -> Variables:
+    """Return the variables, where the start is held by a boundary state or not, and each end at rest or not."""
     nodes, free_yaw = layout.shape.nodes, layout.shape.free_yaw
     table, own = _slots(nodes, 2 if free_yaw else 1, held, rests)
     k = point_constraints.variables(free_yaw)
@@ -87,14 +87,14 @@ def variables_of(layout: Layout, held: tuple[bool, bool], rests: tuple[bool, boo
     return Variables(table, local[0] * table.shape[1] + local[1], len(positive), table.size, band, sparsity)
 
 
-def _slots(nodes: int, columns: int, held: tuple[bool, bool], rests: tuple[bool, bool]) -> tuple[NDArray, NDArray]:
+def _slots(nodes: int, columns: int, held: bool, rests: tuple[bool, bool]) -> tuple[NDArray, NDArray]:
     """Return the entry of v of each coefficient, -1 where it is fixed; and which have an entry of their own."""
     own = np.arange((nodes + 3) * columns).reshape(nodes + 3, columns)
     slots = own.copy()
     for end, (h, yaw) in enumerate((
         ([0, 1, 2, 3], [0, 1]), ([nodes + 2, nodes + 1, nodes, nodes - 1], [nodes + 1, nodes])
     )):  # fmt: skip
-        if held[end]:
+        if held and end == 0:
             slots[h[:3], 0] = _FIXED
             if columns == 2:
                 slots[yaw, 1] = _FIXED

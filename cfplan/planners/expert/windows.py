@@ -81,7 +81,7 @@ def by_windows(
         window = Segment(
             whole.path if at_start and at_end else whole.path.part(first * step, last * step),
             whole.airframe, whole.limits,
-            Ends(state, ends.end if at_end else None, continues=not at_start, joint=None if at_end else left - first),
+            Ends(state, continues=not at_start, joint=None if at_end else left - first),
             yaw, layout_of(Shape(last - first, shape.free_yaw, shape.turning_limited, (3 * at_start, 3 * at_end))),
             whole.caps and whole.caps.part(first * step, last * step), whole.slowness,
         )  # fmt: skip

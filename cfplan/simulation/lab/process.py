@@ -15,6 +15,7 @@ import numpy as np
 
 from cfplan.errors import CfplanError, InputError
 from cfplan.flight.clock import REAL_CLOCK, Clock
+from cfplan.flight.radio.crtp import NULL_PACKET, Port, pack
 from cfplan.flight.real_time import lock_memory
 from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME
 from cfplan.simulation.lab.radio import Radio, RadioFault
@@ -22,7 +23,6 @@ from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET, Port, pack
 from cfplan.simulation.virtual_vicon.cameras import Cameras
 from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
 from cfplan.simulation.virtual_vicon.vicon import VirtualVicon

@@ -3,11 +3,11 @@
 A Crazyradio sends one packet, gets at most one back with the acknowledgement, and repeats both until it has got it
 (cflib's safelink). Loss therefore costs time and nothing else, until one side's queue is full: the computer's holds
 the packet in the air and one more, the vehicle's 120. What a dead radio held comes out when it returns, and is old;
-but setpoints and poses that wait for long do not come, as the pilot's link sees to (`flight/radio/perishable.py`).
+but setpoints and poses that wait for long do not come: both radios, real and simulated, send from an `Outbox`.
 """
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import ClassVar
@@ -15,11 +15,12 @@ from typing import ClassVar
 import numpy as np
 
 from cfplan.errors import InputError
-from cfplan.flight.radio.perishable import KEEPS_FOR, is_perishable
+from cfplan.flight.radio.crtp import NULL_PACKET
+from cfplan.flight.radio.perishable import Outbox
 from cfplan.simulation.timed_fault import TimedFault
 
 TRANSACTION = 0.001  # s a transmission and its acknowledgement: 1,000 a second, as cflib gets
-COMPUTER_QUEUE = 2  # packets: the one in the air, and cflib's queue of one
+COMPUTER_QUEUE = 2  # packets: the one in the air, and the one that waits behind it
 _VEHICLE_QUEUE = 120
 
 
@@ -53,13 +54,12 @@ class Radio:
         self._next = now
         self._faults: list[tuple[float, float, RadioFault]] = []
         self._now = now  # s, of the last step
-        self._up: deque[tuple[float, bytes]] = deque()  # each with when, s, it was sent
+        self._outbox = Outbox()
         self._down: deque[bytes] = deque()
         self._on_way_up: deque[tuple[float, bytes]] = deque()
         self._on_way_down: deque[tuple[float, bytes]] = deque()
         self._repeated = False  # the vehicle has the packet in the air, whose acknowledgement was lost
         self.dropped = 0  # packets dropped by a full queue
-        self.acknowledged: Callable[[], None] = lambda: None  # called with each acknowledgement
 
     def inject(self, fault: RadioFault, now: float) -> None:
         """Let something go wrong; its start counts from now."""
@@ -67,27 +67,18 @@ class Radio:
 
     @property
     def full(self) -> bool:
-        """Return whether the computer's queue is full."""
-        return len(self._up) >= COMPUTER_QUEUE
-
-    @property
-    def stuck(self) -> bool:
-        """Return whether what waits in the computer's queue has perished there."""
-        return self.full and self._perished(*self._up[-1], self._now)
+        """Return whether the computer's side takes no more packet now."""
+        return self._outbox.full(self._now)
 
     @property
     def busy(self) -> bool:
         """Return whether any packet is on its way."""
-        return bool(self._up or self._down or self._on_way_up or self._on_way_down)
+        return bool(not self._outbox.empty or self._down or self._on_way_up or self._on_way_down)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet from the computer; if the queue is full, one of both is dropped: what has perished, or this."""
-        if self.full:
+        """Send a packet from the computer; it is dropped if there is no room."""
+        if not self._outbox.put(packet, self._now):
             self.dropped += 1
-            if self.stuck:
-                self._up[-1] = self._now, packet
-        else:
-            self._up.append((self._now, packet))
 
     def answer(self, packet: bytes) -> None:
         """Send a packet from the vehicle; it is dropped if the queue is full."""
@@ -99,13 +90,13 @@ class Radio:
     def step(self, now: float) -> tuple[list[bytes], list[bytes]]:
         """Return the packets that have reached the vehicle by now, and those that have reached the computer."""
         self._now = max(self._now, now)
-        if not (self._up or self._down):
+        if self._outbox.empty and not self._down:
             if now > self._next:
                 self._next = now
                 self._transact(now)  # an empty packet, as cflib sends if there is nothing else
             if not (self._on_way_up or self._on_way_down):
                 return [], []
-        while self._next <= now and (self._up or self._down):
+        while self._next <= now and (not self._outbox.empty or self._down):
             self._transact(self._next)
             self._next += TRANSACTION
         return _arrived(self._on_way_up, now), _arrived(self._on_way_down, now)
@@ -120,23 +111,17 @@ class Radio:
                 return
             due += delay.strength if delay is not None else 0.0
             silent = self._acting(RadioFaultKind.UNACKNOWLEDGED, time) is not None
-        if self._up:
-            sent, packet = self._up[0]
-            if not self._repeated and not self._perished(sent, packet, time):
+        if not self._outbox.empty:
+            packet = self._outbox.transmission(time)
+            if not self._repeated and packet != NULL_PACKET:
                 self._on_way_up.append((due, packet))
             self._repeated = silent  # the vehicle takes a repeated packet once
             if not silent:
-                self._up.popleft()
+                self._outbox.acknowledged()
         if silent:
             return
-        self.acknowledged()
         if self._down:
             self._on_way_down.append((due, self._down.popleft()))
-
-    @staticmethod
-    def _perished(sent: float, packet: bytes, now: float) -> bool:
-        """Return whether a packet is not worth sending any more."""
-        return now - sent > KEEPS_FOR and is_perishable(packet[0], packet[1:])
 
     def _acting(self, kind: RadioFaultKind, time: float) -> RadioFault | None:
         for begin, end, fault in self._faults:

@@ -17,9 +17,9 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.exceptions import WrongUriType
 
 from cfplan.errors import InputError, LinkError
+from cfplan.flight.radio.crtp import NULL_PACKET
 from cfplan.simulation.lab.lab import Lab, start_lab
 from cfplan.simulation.lab.room import lab_address
-from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET
 from cfplan.vehicle.airframes import AIRFRAMES
 
 _SCHEME = "sim://"

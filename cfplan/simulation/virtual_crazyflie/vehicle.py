@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import GAIN_PARAMETERS, YAW_CORRECT, Timeouts
+from cfplan.flight.radio.crtp import LARGEST_PAYLOAD, Port, pack
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.simulation.engine.layout import MASS, MOTORS, THRUST_MAX
 from cfplan.simulation.virtual_crazyflie.battery import Battery
@@ -37,7 +38,6 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import Stabilizer
 from cfplan.simulation.virtual_crazyflie.supervisor import PERIOD as SUPERVISOR_PERIOD
 from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
-from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import yaw_of
 

@@ -25,8 +25,7 @@ def test_the_setpoint_is_that_of_the_moment(payloads):
 
 def test_the_packet_carries_the_payload_to_the_generic_commander(payloads):
     stream = Stream(payloads, 100.0)
-    assert stream.packet(7).get_header() == 0x7C
-    assert bytes(stream.packet(7).data) == payloads[7].tobytes()
+    assert stream.packet(7) == b"\x7c" + payloads[7].tobytes()
 
 
 def test_the_reference_between_setpoints_is_between_them(payloads):

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
+from cfplan.flight.setpoints.byte_check import check_bytes
 from cfplan.flight.setpoints.commitment import (
     KEPT_BEHIND,
     LEAST_AHEAD,
@@ -23,7 +24,7 @@ from cfplan.flight.setpoints.commitment import (
     propose,
     splice,
 )
-from cfplan.flight.setpoints.encoding import LEAD, RATE, check_bytes, encode_trajectory
+from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_trajectory
 from cfplan.flight.setpoints.packets import QUATERNION_PLACE, compress_quaternion, decode
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops

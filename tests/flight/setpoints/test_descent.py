@@ -20,7 +20,7 @@ BESIDE = [(2.05, 0.0), (-2.05, 3.8), (1.6, -3.5)]  # m; the walls are at 2.25 an
 
 
 def down(place, aside, lowest=-2.0):
-    return descent(place, 0.7, 0.0, QUICK, 0.0, lowest, LIMITS, RATE, aside)
+    return descent(place, 0.7, 0.0, QUICK, 0.0, lowest, limits=LIMITS, rate=RATE, aside=aside)
 
 
 @pytest.mark.parametrize("height", [0.3, 0.6, 1.2, 1.8])

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfplan.flight.setpoints.byte_check import check_bytes
 from cfplan.flight.setpoints.commitment import Commitment, propose, splice
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under, moment_rates
 from cfplan.flight.setpoints.stops import encode_stops

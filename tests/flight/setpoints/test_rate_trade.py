@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from cfplan.flight.setpoints.encoding import check_bytes, encode_trajectory
+from cfplan.flight.setpoints.byte_check import check_bytes, harmless_rates
+from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.flight.setpoints.level_out import UNTIL_WATCHDOG
 from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.flight.setpoints.rate_trade import (
     LEAN_MAX,
     TRADED_RATE_MAX,
-    UNTIL_WATCHDOG,
     AttitudeGains,
     ahead,
     gains_under,
-    harmless_rates,
     trade_rates,
     turns_for,
 )

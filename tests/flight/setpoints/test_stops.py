@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
+from cfplan.flight.setpoints.level_out import UNTIL_WATCHDOG
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.flight.setpoints.rate_trade import UNTIL_WATCHDOG
 from cfplan.flight.setpoints.stops import encode_stops, stop_motion
 from cfplan.vehicle.airframe import GRAVITY
 

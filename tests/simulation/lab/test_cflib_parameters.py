@@ -1,4 +1,4 @@
-"""The pilot's link by cflib itself, to a virtual Crazyflie in the same process: parameters, and setpoints of others."""
+"""The pilot's link by a driver of cflib, to a virtual Crazyflie in one process: parameters, setpoints of others."""
 
 import queue
 import struct
@@ -14,9 +14,9 @@ from waiting import PATIENCE, a_moment, until
 from cfplan.errors import LinkError
 from cfplan.flight.pilot.vehicle_rules import PARAMETER_RULES
 from cfplan.flight.radio.connection import connect
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.vehicle.airframes import AIRFRAMES
 
 _STEP = 10  # ms of the vehicle's time at each look for a packet
@@ -24,13 +24,13 @@ NAMES = [rule.name for rule in PARAMETER_RULES]
 
 
 class DirectDriver(CRTPDriver):
-    """A driver without a medium; the vehicle's time goes on when cflib looks for packets."""
+    """A driver without a medium; the vehicle's time goes on when the link looks for a packet and none is there."""
 
     needs_resending = False
     vehicle: VirtualCrazyflie
     silent = False
     guest = b""  # a packet that another client sends at each step: by the vehicle's time, which goes faster than ours
-    null = pack(Port.LINK, 3, b"")  # sent at each step: cflib's pings are too rare by that time to keep the connection
+    null = pack(Port.LINK, 3, b"")  # sent at each step: pings are too rare by that time to keep the connection
 
     def connect(self, uri, statistics, error):
         if not uri.startswith("direct://"):
@@ -45,9 +45,10 @@ class DirectDriver(CRTPDriver):
 
     def receive_packet(self, wait=0):
         with self._lock:
-            self.vehicle.receive(self.guest or self.null)
-            self.vehicle.advance(_STEP)
-            self._collect()
+            if self._came.empty():
+                self.vehicle.receive(self.guest or self.null)
+                self.vehicle.advance(_STEP)
+                self._collect()
         try:
             datagram = self._came.get_nowait()
         except queue.Empty:

@@ -5,11 +5,11 @@ from collections.abc import Callable
 
 import pytest
 
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port, pack
 from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.vehicle.airframes import AIRFRAMES
 

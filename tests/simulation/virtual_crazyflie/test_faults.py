@@ -5,11 +5,11 @@ import struct
 import numpy as np
 import pytest
 
+from cfplan.flight.radio.crtp import Port
 from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.simulation.virtual_crazyflie.wire import Port
 from tests.simulation.virtual_crazyflie.conftest import Rig
 
 HOVER, TAKE_OFF = 0.5, 7

@@ -4,10 +4,10 @@ import struct
 
 import pytest
 
+from cfplan.flight.radio.crtp import Port
 from cfplan.simulation.virtual_crazyflie.commander import Priority
 from cfplan.simulation.virtual_crazyflie.high_level import PlannerState
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.simulation.virtual_crazyflie.wire import Port
 
 EBUSY, ENOEXEC, PLANNER_BUSY = 16, 8, 1
 ZERO_ATTITUDE = struct.pack("<fffH", 0.0, 0.0, 0.0, 0)  # what cflib sends when it closes a link

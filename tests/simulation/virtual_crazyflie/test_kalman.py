@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfplan.flight.pilot.vehicle_rules import EXTERNAL_ATTITUDE_STD, EXTERNAL_POSITION_STD
+from cfplan.flight.radio.crtp import Port
 from cfplan.simulation.engine import kalman as estimator
 from cfplan.simulation.engine.kalman import Prior, estimate, new_filter, reset, step_filter
 from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.airframes import AIRFRAMES

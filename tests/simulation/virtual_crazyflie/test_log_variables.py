@@ -8,10 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from cfplan.flight.radio.crtp import LARGEST_PAYLOAD, Port, pack
 from cfplan.simulation.virtual_crazyflie.log_blocks import MOST_BYTES, log_toc
 from cfplan.simulation.virtual_crazyflie.parameters import parameter_toc
 from cfplan.simulation.virtual_crazyflie.toc import make_toc
-from cfplan.simulation.virtual_crazyflie.wire import LARGEST_PAYLOAD, Port, pack
 
 LOG, PARAMETERS = log_toc(), parameter_toc()
 _SETTINGS = 1

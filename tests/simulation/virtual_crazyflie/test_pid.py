@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
+from cfplan.flight.radio.crtp import Port
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.simulation.virtual_crazyflie.wire import Port
 
 
 @pytest.fixture

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from cfplan.flight.radio.crtp import Port
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
-from cfplan.simulation.virtual_crazyflie.wire import Port
 
 
 def switch(rig, command: int) -> list[bytes]:

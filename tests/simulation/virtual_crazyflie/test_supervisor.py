@@ -5,12 +5,12 @@ import struct
 import numpy as np
 import pytest
 
+from cfplan.flight.radio.crtp import Port
 from cfplan.flight.radio.supervisor_bits import DECK_FAULT, HIGH_LEVEL_ACTIVE, HIGH_LEVEL_DISABLED
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State, Supervisor
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
-from cfplan.simulation.virtual_crazyflie.wire import Port
 from cfplan.vehicle.airframes import AIRFRAMES
 
 PLANNER_IDLE = {"planner_active": False, "planner_finished": False, "planner_disabled": False}

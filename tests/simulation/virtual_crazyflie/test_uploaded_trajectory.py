@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from cfplan.flight.on_board.certified_pieces import certified_compressed, certified_pieces
+from cfplan.flight.radio.crtp import Port
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import path_through
 from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.virtual_crazyflie.wire import Port
 
 LIMITS = load_limits(Path(__file__).parents[3] / "safety.yaml")
 POINTS = [[-1.2, -1.2, 0.7], [0.2, 0.4, 1.1], [1.2, -0.6, 0.9], [1.2, 1.2, 1.1]]

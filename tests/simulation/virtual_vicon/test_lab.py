@@ -8,11 +8,11 @@ from waiting import PATIENCE, until
 
 from cfplan.flight.mocap.pose_check import Verdict
 from cfplan.flight.mocap.source import pose_source
+from cfplan.flight.radio.crtp import NULL_PACKET
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.lab.lab import start_lab
 from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.wire import NULL_PACKET
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.vehicle.airframes import load_airframe

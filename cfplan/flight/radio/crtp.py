@@ -1,4 +1,4 @@
-"""CRTP packets on the air: a header of port and channel, then at most 30 bytes."""
+"""CRTP packets as they go over the air: a header of port and channel, then at most 30 bytes."""
 
 from enum import IntEnum
 

@@ -1,0 +1,102 @@
+"""Transports carry packets between a session and a vehicle: their protocol, and the transport by a driver of cflib."""
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+_LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet checks whether it must end
+_SENDING = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
+
+Hear = Callable[[bytes], None]
+Fail = Callable[[str], None]
+_log = logging.getLogger(__name__)
+
+
+class Transport(Protocol):
+    """A link to one vehicle, open. Packets may be lost, repeated or late, but none overtakes another."""
+
+    def listen(self, hear: Hear, fail: Fail) -> None:
+        """Call `hear` with each packet that comes, and `fail` with the reason once the link is gone; called once."""
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet within some milliseconds, or drop it; never wait for longer."""
+
+    def close(self) -> None:
+        """End the link; may be called twice."""
+
+
+def hand_on(receive: Callable[[float], bytes | None], hear: Hear, ended: threading.Event) -> None:
+    """Call `hear` in a thread with each packet that `receive` returns, until `ended`; `receive` takes its patience, s.
+
+    An exception in `hear` is logged, and the next packet heard: no packet may end a link.
+    """
+
+    def run() -> None:
+        while not ended.is_set():
+            packet = receive(_LOOK_PERIOD)
+            if packet is not None:
+                try:
+                    hear(packet)
+                except Exception:
+                    _log.exception("a packet could not be read: %s", packet.hex())
+
+    threading.Thread(target=run, name="CRTP", daemon=True).start()
+
+
+class DriverTransport:
+    """A transport by one of cflib's link drivers."""
+
+    def __init__(self, uri: str):
+        """Connect. Raises ValueError if no driver knows the URI, and the errors of its driver."""
+        from cflib import crtp
+
+        self._fail: Fail = lambda _: None
+        self._failure = ""  # why the link is gone
+        self._sending, self._ended = threading.Lock(), threading.Event()
+        self._driver: Any = crtp.get_link_driver(uri, lambda _: None, self._failed)
+        if self._driver is None:
+            raise ValueError("No driver found or malformed URI")
+
+    def listen(self, hear: Hear, fail: Fail) -> None:
+        self._fail = fail
+        if self._failure:
+            fail(self._failure)
+        hand_on(self._receive, hear, self._ended)
+
+    def send(self, packet: bytes) -> None:
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        if not self._ended.is_set() and self._sending.acquire(timeout=_SENDING):
+            try:
+                self._driver.send_packet(CRTPPacket(packet[0], bytearray(packet[1:])))
+            finally:
+                self._sending.release()
+
+    def close(self) -> None:
+        if not self._ended.is_set():
+            self._ended.set()
+            self._driver.close()
+
+    def _receive(self, wait: float) -> bytes | None:
+        packet = self._driver.receive_packet(wait)
+        return None if packet is None else bytes((packet.header, *packet.data))
+
+    def _failed(self, reason: str) -> None:
+        """Note why the link is gone, and close it: some drivers report the same error over and over."""
+        if not self._failure:
+            self._failure = reason
+            self._fail(reason)
+            threading.Thread(target=self.close, daemon=True).start()  # it waits for the thread that reports
+
+
+def register_drivers(drivers: Sequence[type]) -> None:
+    """Let cflib know these link drivers, to be tried before its own."""
+    from cflib import crtp
+    from cflib.crtp.udpdriver import UdpDriver
+
+    if UdpDriver not in crtp.CLASSES:  # one of cflib's own; there may be others' already
+        crtp.init_drivers()
+    for driver in reversed(drivers):
+        if driver not in crtp.CLASSES:
+            crtp.CLASSES.insert(0, driver)
