@@ -24,7 +24,7 @@ REPOSITORY = Path(__file__).parents[1]
 def test_a_wheel_takes_every_model_example_and_layout_along():
     packed = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["data-files"]
     found = {file for patterns in packed.values() for pattern in patterns for file in REPOSITORY.glob(pattern)}
-    wanted = {REPOSITORY / "safety.yaml", *(REPOSITORY / "flights").iterdir()}
+    wanted = {REPOSITORY / "safety.yaml", *filter(Path.is_file, (REPOSITORY / "flights").rglob("*"))}
     wanted |= set((REPOSITORY / "layouts").iterdir())
     wanted |= {file for file in (REPOSITORY / "models").glob("*/*") if file.suffix in (".safetensors", ".json")}
     assert wanted == found

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli import fleet, options
 from cfplan.cli.output import Steps, print_json, print_table
 from cfplan.errors import ExitCode
 
@@ -25,12 +25,17 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     """Check every limit along the plan of a path or of a plan file and the setpoint packets that would fly it, and make
     their dry run: the deviation to expect.
 
+    For a fleet file: plan and rehearse each vehicle, and check how near each pair comes.
+
     For a record's folder: certify again everything that was committed in that flight, under the limits in the record,
     and check that the setpoints sent are those committed. Exit code 4 if a limit is exceeded or a setpoint differs.
     """
     steps = Steps(as_json=as_json)
     if path_or_plan.is_dir():
         return _check_record(path_or_plan, steps)
+    if fleet.is_fleet(path_or_plan):
+        fleet.rehearse_and_print(path_or_plan, safety_file, planning, steps)
+        return 0
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate

@@ -65,6 +65,13 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
 @click.option(
     "--waypoints", callback=_range, default="3-6", show_default=True, help="Least and greatest number of waypoints."
 )
+@click.option(
+    "--shape",
+    type=click.Choice(["min-snap", "fastest", "any"]),
+    default="min-snap",
+    show_default=True,
+    help="Path through the waypoints: of least snap, the fastest in a drawn room, or either.",
+)
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
 @click.option("--yaw", type=click.Choice(["any", "fixed", "tangent", "free"]), default="any", show_default=True)
 @click.option("--epsilon", type=float, default=0.0, help="Perturb copies by at most this at every node, m.")
@@ -92,6 +99,7 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
     The same options give the same rows with any number of workers; a failed solve is a row with its reason.
     """
     from cfplan.learning.dataset import make_dataset
+    from cfplan.planning.path.search import fastest_by_search
 
     spec = _spec(what)
     with _progress(as_json) as progress:
@@ -99,6 +107,7 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
         make_dataset(
             folder,
             spec,
+            choose=fastest_by_search,
             workers=workers,
             scheduler=scheduler,
             on_rows=lambda rows: progress.advance(task, rows),
@@ -112,12 +121,13 @@ def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **wha
 def _spec(what: dict[str, Any]) -> "DatasetSpec":
     """Return the dataset's spec from the options."""
     from cfplan.geometry.path_families import USUAL
+    from cfplan.geometry.path_file import PathShape
     from cfplan.geometry.yaw import YawMode
     from cfplan.learning.dataset_spec import DRAWN, GIVEN, DatasetSpec, Labeller, Relabel
     from cfplan.safety.limit_sets import DATA_SETS
     from cfplan.safety.limits_file import load_limits
 
-    file, limits, yaw = what.pop("safety"), what["limits"], what["yaw"]
+    file, limits, yaw, shape = what.pop("safety"), what["limits"], what["yaw"], what["shape"]
     if limits not in (DRAWN, *DATA_SETS):
         known = ", ".join((DRAWN, *DATA_SETS))
         raise InputError(f"no limit set {limits!r}", where="--limits", hint=f"one of {known}; or --safety FILE")
@@ -130,6 +140,7 @@ def _spec(what: dict[str, Any]) -> "DatasetSpec":
     return DatasetSpec(
         **what | given | {
             "families": () if what["boxes"] else USUAL, "yaw": None if yaw == "any" else YawMode(yaw),
+            "shape": None if shape == "any" else PathShape(shape),
             "relabel": Relabel(what["relabel"]), "planner": Labeller(what["planner"]),
         },
     )  # fmt: skip

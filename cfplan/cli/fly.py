@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli import fleet, options
 from cfplan.cli.fly_waypoints import fly_waypoints
 from cfplan.cli.output import Steps, print_json, print_table, styled
 from cfplan.errors import ExitCode, InputError
@@ -104,6 +104,12 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
+    if fleet.is_fleet(path_or_plan):
+        raise InputError(
+            "fleets are planned and checked, but not flown yet",
+            where=str(path_or_plan),
+            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
+        )
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared

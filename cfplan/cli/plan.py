@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli import fleet, options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
 from cfplan.numbers import shown
@@ -16,7 +16,10 @@ if TYPE_CHECKING:
 
 @click.command(
     short_help="Plan a certified trajectory for a path.",
-    epilog="Example: cfplan plan flights/circle.yaml -o circle.parquet",
+    epilog="""\b
+Examples:
+  cfplan plan flights/circle.yaml -o circle.parquet
+  cfplan plan flights/fleets/two.yaml""",
 )
 @options.path_file
 @options.planning
@@ -33,9 +36,16 @@ def plan(
     as_json: bool,
     **planning: Any,
 ) -> None:
-    """Plan the fastest flight along PATH within every limit, and print its certificate."""
-    _check_files(output, figure, force)
+    """Plan the fastest flight along PATH within every limit, and print its certificate.
+
+    For a fleet file: plan each vehicle, let them start later or fly slower where they would come too near, and print
+    how near each pair comes.
+    """
     steps = Steps(as_json=as_json)
+    if fleet.is_fleet(path_file):
+        fleet.refuse_output(output, figure)
+        return fleet.plan_and_print(path_file, safety_file, planning, steps)
+    _check_files(output, figure, force)
     limits = options.read_limits(safety_file, path_file, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli import fleet, options
 from cfplan.cli.output import Steps, print_json, print_table
 
 
@@ -15,8 +15,13 @@ from cfplan.cli.output import Steps, print_json, print_table
 @options.planning
 @options.as_json
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
-    """Rehearse a path or a plan file: its setpoints on drawn vehicles, by the firmware's filter and controller."""
+    """Rehearse a path or a plan file: its setpoints on drawn vehicles, by the firmware's filter and controller.
+
+    For a fleet file: rehearse each vehicle of the fleet.
+    """
     steps = Steps(as_json=as_json)
+    if fleet.is_fleet(path_or_plan):
+        return fleet.rehearse_and_print(path_or_plan, safety_file, planning, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners and simulator"):
         from cfplan.preparation.plan_flight import plan_flight

@@ -37,6 +37,12 @@ if TYPE_CHECKING:
 @click.option("--rate", type=float, default=2e-3, show_default=True, help="Highest learning rate.")
 @click.option("--epsilon", type=float, default=0.0, help="Perturb the paths of half the windows by at most this, m.")
 @click.option("--seed", type=int, default=0, show_default=True)
+@click.option(
+    "--start",
+    type=click.Path(path_type=Path),
+    metavar="MODEL",
+    help="Model folder whose weights the training starts from.  [default: random weights]",
+)
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda; several GPUs under torchrun.")
 @options.as_json
 def train(dataset: Path, folder: Path, device: str, as_json: bool, **what: Any) -> None:

@@ -1,4 +1,4 @@
-"""Path families: random paths of the kinds that people fly, each from a seed, from waypoints by min_snap."""
+"""Path families: random waypoints of the kinds of paths that people fly, each from a seed."""
 
 import math
 from collections.abc import Callable
@@ -8,8 +8,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.geometry.min_snap import min_snap
-from cfplan.geometry.path import Path, rotation_about_z
+from cfplan.geometry.path import rotation_about_z
 from cfplan.geometry.random_paths import SPACING, generator, random_waypoints
 
 BOXES = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))  # m, sides of the boxes that half of the random paths are drawn in
@@ -36,15 +35,11 @@ USUAL = (
 )  # fmt: skip
 
 
-def family_path(family: Family, seed: int | np.random.SeedSequence) -> Path:
-    """Return the path of a family that a seed decides, turned about z by a random angle.
-
-    Raises:
-        InputError: the waypoints that were drawn make no path.
-    """
+def family_waypoints(family: Family, seed: int | np.random.SeedSequence) -> NDArray:
+    """Return waypoints of a family, (K, 3) m, that a seed decides, turned about z by a random angle."""
     random = generator(seed)
     points = _DRAW[family](random)
-    return min_snap(points @ rotation_about_z(random.uniform(-math.pi, math.pi)).T)
+    return np.asarray(points @ rotation_about_z(random.uniform(-math.pi, math.pi)).T)
 
 
 def _logarithmic(random: np.random.Generator, low: float, high: float) -> float:

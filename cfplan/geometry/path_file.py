@@ -25,7 +25,7 @@ import hashlib
 import math
 import pathlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, Any, Self
 
@@ -89,6 +89,17 @@ class PathFile:
     regions: tuple[Region, ...] = ()  # where each waypoint may be passed, all laps; empty where the path was given
     corridor: float | None = None  # m, how far the path may lead from the straight lines between waypoints
 
+    def placed(self, offset: ArrayLike, turn: float) -> "PathFile":
+        """Return the same turned by `turn`, rad, about z through the origin, then moved by `offset`, (3,) m."""
+        fixed = self.yaw is YawMode.FIXED
+        return replace(
+            self,
+            path=self.path.placed(np.asarray(offset, dtype=float), turn),
+            yaw_angle=math.remainder(self.yaw_angle + turn, math.tau) if fixed else 0.0,
+            waypoints=self.waypoints @ rotation_about_z(turn).T + offset,
+            regions=tuple(region and region.turned(turn) for region in self.regions),
+        )
+
 
 class _Yaw(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -97,13 +108,20 @@ class _Yaw(BaseModel):
     angle_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
 
 
-class _Place(BaseModel):
+class PathPlace(BaseModel):
+    """Where in the room a path lies: it is turned about z through the origin, then moved."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     x: float = 0.0
     y: float = 0.0
     z: float = 0.0
     yaw_deg: float = Field(default=0.0, ge=-360.0, le=360.0)
+
+    @property
+    def motion(self) -> tuple[tuple[float, float, float], float]:
+        """Return the offset, m, and the turn, rad."""
+        return (self.x, self.y, self.z), math.radians(self.yaw_deg)
 
 
 def _short_yaw(value: Any) -> Any:
@@ -175,7 +193,7 @@ class _Content(BaseModel):
     yaw: Annotated[_Yaw, BeforeValidator(_short_yaw)] = _Yaw(mode=YawMode.FIXED)
     laps: int = Field(default=1, ge=1, le=1000)
     speed: Annotated[float, Field(gt=0.0, le=1.0), BeforeValidator(_share)] = 1.0
-    place: _Place = _Place()
+    place: PathPlace = PathPlace()
 
 
 def fingerprint(file: pathlib.Path) -> str:
@@ -194,7 +212,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         InputError: a mistake in it or in the file that it names; names line and column.
     """
     file = pathlib.Path(file)
-    content, places = read_yaml_with_places(file, _Content)
+    content, places = read_yaml_with_places(file, _Content, lambda data: _of_one_vehicle(data, file))
     given = _source(content, places)
     through = given in ("waypoints", "points")
     _check_choice(content, places, given, through)
@@ -208,24 +226,31 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
             where=places.where_key("yaw", "angle_deg"),
             hint="leave angle_deg out, or set mode: fixed",
         )
-    place, turn = content.place, math.radians(content.place.yaw_deg)
-    offset = np.array([place.x, place.y, place.z])
-    fixed = content.yaw.mode is YawMode.FIXED
-    angle = math.remainder(math.radians(content.yaw.angle_deg) + turn, math.tau) if fixed else 0.0
     return PathFile(
         name=content.name or file.stem,
-        path=path.placed(offset, turn),
+        path=path,
         yaw=content.yaw.mode,
-        yaw_angle=angle,
+        yaw_angle=math.radians(content.yaw.angle_deg),
         speed=content.speed,
         laps=content.laps,
-        waypoints=waypoints @ rotation_about_z(turn).T + offset,
+        waypoints=waypoints,
         source=file,
         losses=tuple(losses),
         shape=content.shape if through else None,
-        regions=_regions(content, len(waypoints), turn) if through else (),
+        regions=_regions(content, len(waypoints)) if through else (),
         corridor=content.corridor,
-    )
+    ).placed(*content.place.motion)
+
+
+def _of_one_vehicle(data: dict[str, Any], file: pathlib.Path) -> dict[str, Any]:
+    """Return the data, or raise InputError where they are those of a fleet file."""
+    if "vehicles" in data:
+        raise InputError(
+            "a fleet file, where the path of one vehicle is needed",
+            where=str(file),
+            hint="`cfplan plan`, `check` and `sim` take fleets; the others take the path file of one vehicle",
+        )
+    return data
 
 
 def _check_choice(content: _Content, places: Places, given: str, through: bool) -> None:
@@ -261,11 +286,11 @@ def _check_choice(content: _Content, places: Places, given: str, through: bool) 
             )
 
 
-def _regions(content: _Content, count: int, turn: float) -> tuple[Region, ...]:
-    """Return the region of each waypoint of all laps, `count`, in the frame of the room."""
+def _regions(content: _Content, count: int) -> tuple[Region, ...]:
+    """Return the region of each waypoint of all laps, `count`, before the path is placed."""
     if content.waypoints is None:
         return (None,) * count
-    of_file = [waypoint.region and waypoint.region.turned(turn) for waypoint in content.waypoints]
+    of_file = [waypoint.region for waypoint in content.waypoints]
     lap = [*of_file[1:-1], of_file[0]]
     return (*of_file[:1], *lap * content.laps) if content.laps > 1 else tuple(of_file)
 

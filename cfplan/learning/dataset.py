@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from cfplan.errors import InputError
 from cfplan.files.whole import whole
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
-from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, make_rows
+from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, ChoosePath, make_rows
 from cfplan.learning.workers import pool
 from cfplan.planners.solution import Status
 
@@ -39,12 +39,14 @@ def make_dataset(
     folder: Path,
     spec: DatasetSpec,
     *,
+    choose: ChoosePath | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     on_rows: Callable[[int], None] = lambda _: None,
 ) -> DatasetSpec:
     """Make the missing shards of a dataset. `on_rows` is called with the number of rows that were added on disk.
 
+    `choose` chooses paths through waypoints, for a spec that asks for chosen ones.
     Stopped at any moment, it loses the shards under way and no more; the next call makes those.
     Raises InputError where the folder holds another dataset or cannot be written, SchedulerError where the scheduler
     does not answer within ten seconds.
@@ -53,7 +55,7 @@ def make_dataset(
     missing = [number for number in range(spec.shards) if not _shard(folder, SHARDS, number).exists()]
     on_rows(spec.rows - sum(len(spec.shard(number)) for number in missing))
     with pool(workers, scheduler) as work:
-        for number, rows, timing in work(partial(label_shard, spec), missing):
+        for number, rows, timing in work(partial(label_shard, spec, choose=choose), missing):
             try:
                 for part, content in ((TIMING, timing), (SHARDS, rows)):
                     with whole(_shard(folder, part, number)) as unfinished:
@@ -106,9 +108,9 @@ def describe(folder: Path) -> dict[str, Any]:
     }
 
 
-def label_shard(spec: DatasetSpec, number: int) -> tuple[int, bytes, bytes]:
+def label_shard(spec: DatasetSpec, number: int, choose: ChoosePath | None = None) -> tuple[int, bytes, bytes]:
     """Label a shard, as a worker does: return its number and the bytes of its two files."""
-    rows, timing = make_rows(spec, spec.shard(number))
+    rows, timing = make_rows(spec, spec.shard(number), choose)
     return number, _parquet(rows), _parquet(timing)
 
 

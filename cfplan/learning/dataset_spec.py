@@ -12,6 +12,7 @@ from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.files.whole import whole
 from cfplan.geometry.path_families import USUAL, Family
+from cfplan.geometry.path_file import PathShape
 from cfplan.geometry.yaw import YawMode
 from cfplan.safety.limit_sets import DATA_SETS, LimitSet
 from cfplan.safety.limits import PlanLimits
@@ -21,7 +22,7 @@ SPEC_FILE = "dataset.json"
 DRAWN, GIVEN = "drawn", "given"  # limits that are no set by name
 _MOST = 10_000_000  # paths, copies of one, rows of a shard
 _MOST_WAYPOINTS, _MOST_NODES = 1000, 100_000
-_SINCE = {"planner"}  # keys that datasets of older versions lack
+_SINCE = {"planner", "shape"}  # keys that datasets of older versions lack
 _REMEDY = "give another folder, or make the dataset again"
 
 
@@ -53,6 +54,7 @@ class DatasetSpec:
     boxes: tuple[tuple[float, float, float], ...] = ()
     """Sides, m, of where waypoints are drawn; paths take the boxes in turn, instead of families."""
     waypoints: tuple[int, int] = (3, 6)  # least and most
+    shape: PathShape | None = PathShape.MIN_SNAP  # of the paths through waypoints; None: drawn for each path
     nodes: int = 100  # grid intervals
     yaw: YawMode | None = None  # None: drawn for each path
     epsilon: float = 0.0  # m, perturbation of the copies at each node

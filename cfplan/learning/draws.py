@@ -10,9 +10,11 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.safety.limit_sets import LIMIT_SETS, LimitSet
 from cfplan.safety.limits import PlanLimits, within_reserve
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -29,6 +31,7 @@ LOAD = (0.95, 1.25)  # times a known vehicle's mass
 THRUST_TO_WEIGHT = (1.4, 4.0)
 KNOWN, LOADED = 0.25, 0.25  # shares of vehicles
 EDITED, EDIT = 0.25, 0.2  # share of limits that are edited ones, and by how much, as the spread of the logarithm
+WALLS = (0.1, 3.0)  # m, between the waypoints and each wall of a room
 HOVER_ROOM = 0.1  # of the thrust in hover: left between it and the limits of motor thrust at least
 
 
@@ -93,6 +96,14 @@ def edit_limits(random: np.random.Generator, known: LimitSet, airframe: Airframe
     }
     changed["tilt"] = min(changed["tilt"], math.radians(TILT[1]))
     return replace(known.limits, **changed, **within_reserve(airframe, max(0.0, min(reserve, _room(airframe)))))
+
+
+def draw_space(random: np.random.Generator, waypoints: NDArray) -> Space:
+    """Draw a room around waypoints, (K, 3) m: from walls that bind the path to walls that it does not reach."""
+    low, high = ([_logarithmic(random, WALLS) for _ in range(3)] for _ in range(2))
+    return Space(
+        tuple((waypoints.min(axis=0) - low).tolist()), tuple((waypoints.max(axis=0) + high).tolist()), margin=0.0
+    )
 
 
 def _room(airframe: Airframe) -> float:

@@ -1,21 +1,24 @@
 """Label a row of a dataset: a path from its seed, and the solution of the expert or of TOPPQuad."""
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path
-from cfplan.geometry.path_families import Family, family_path
+from cfplan.geometry.path_families import Family, family_waypoints
+from cfplan.geometry.path_file import PathShape
 from cfplan.geometry.random_paths import generator, perturbed, random_waypoints
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel
-from cfplan.learning.draws import draw_limit_set
+from cfplan.learning.draws import draw_limit_set, draw_space
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planners.solution import Solution, Status
 from cfplan.planners.task import PlanningTask
@@ -23,11 +26,15 @@ from cfplan.safety.certificate import certify
 from cfplan.safety.limit_sets import LimitSet
 from cfplan.safety.limits import PlanLimits
 from cfplan.safety.slowing import slow_until_certified
+from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import UNPLANNED, Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
-_LIMITS = 1  # stream of random numbers of limits, vehicles and yaw
+_LIMITS, _SHAPE = 1, 2  # streams of random numbers: of limits, vehicles and yaw; of the path's shape and its room
 ACTIVE_SHARE = 0.98  # of a limit, from which it counts as active
+
+ChoosePath = Callable[[NDArray, Space, LimitSet, YawMode, float], Path]
+"""From waypoints, (K, 3) m, their room, vehicle and limits, and yaw with its angle, rad, to the path to be flown."""
 
 _NUMBERS = pa.list_(pa.float64())
 _TYPES = {
@@ -78,23 +85,41 @@ SCHEMA = pa.schema(
 TIMING_SCHEMA = pa.schema([("row", pa.int64()), ("solve_seconds", pa.float64())])
 
 
-def make_rows(spec: DatasetSpec, rows: range) -> tuple[pa.Table, pa.Table]:
+def make_rows(spec: DatasetSpec, rows: range, choose: ChoosePath | None = None) -> tuple[pa.Table, pa.Table]:
     """Label these rows. Return their table, and a second one of solve times, which are measured and not computed.
 
-    Only `spec` and its number decide a row, so that any worker makes the same.
+    Only `spec` and its number decide a row, so that any worker makes the same. Chosen paths need `choose`.
     """
-    labelled = [_row(spec, row) for row in rows]
+    labelled = [_row(spec, row, choose) for row in rows]
     table = pa.Table.from_pylist([row for row, _ in labelled], schema=SCHEMA)
     timing = [{"row": row["row"], "solve_seconds": seconds} for row, seconds in labelled]
     return table, pa.Table.from_pylist(timing, schema=TIMING_SCHEMA)
 
 
-def clean_path(spec: DatasetSpec, number: int) -> Path:
-    """Return the path of that number, from the dataset's seed."""
+@lru_cache(maxsize=1)
+def clean_path(spec: DatasetSpec, number: int, choose: ChoosePath | None = None) -> Path:
+    """Return the path of that number, from the dataset's seed; the last one is cached for its copies.
+
+    Raises:
+        InputError: the waypoints that were drawn make no path.
+        ValueError: the path is to be chosen, and `choose` is not given.
+    """
+    points = _waypoints(spec, number)
+    random = generator(np.random.SeedSequence(spec.seed, spawn_key=(number, 0, _SHAPE)))
+    drawn = PathShape(random.choice([shape.value for shape in PathShape]))
+    if (spec.shape or drawn) is PathShape.MIN_SNAP:
+        return min_snap(points)
+    if choose is None:
+        raise ValueError("a dataset of chosen paths needs a function that chooses them")
+    return choose(points, draw_space(random, points), *row_limits(spec, number))
+
+
+def _waypoints(spec: DatasetSpec, number: int) -> NDArray:
+    """Return the waypoints of the path of that number, (K, 3) m."""
     if not spec.boxes:
-        return family_path(_family(spec, number), _seed(spec, number, 0))
+        return family_waypoints(_family(spec, number), _seed(spec, number, 0))
     half = np.array(spec.boxes[number % len(spec.boxes)]) / 2
-    return min_snap(random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints))
+    return random_waypoints(_seed(spec, number, 0), np.array([-half, half]), spec.waypoints)
 
 
 def row_limits(spec: DatasetSpec, number: int) -> tuple[LimitSet, YawMode, float]:
@@ -111,10 +136,10 @@ def _family(spec: DatasetSpec, number: int) -> Family:
     return spec.families[number % len(spec.families)]
 
 
-def row_path(spec: DatasetSpec, row: int) -> Path:
-    """Return the path of a row: a clean one, or a perturbed copy of one."""
+def row_path(spec: DatasetSpec, row: int, choose: ChoosePath | None = None) -> Path:
+    """Return the path of a row: a clean one, or a perturbed copy of one. Raises what clean_path() raises."""
     number, copy = divmod(row, 1 + spec.copies)
-    path = clean_path(spec, number)
+    path = clean_path(spec, number, choose)
     return path if copy == 0 else perturbed(path, spec.epsilon, _seed(spec, number, copy))
 
 
@@ -122,7 +147,7 @@ def _seed(spec: DatasetSpec, number: int, copy: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(spec.seed, spawn_key=(number, copy))
 
 
-def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
+def _row(spec: DatasetSpec, row: int, choose: ChoosePath | None) -> tuple[dict[str, Any], float]:
     number, copy = divmod(row, 1 + spec.copies)
     chosen, mode, angle = row_limits(spec, number)
     content: dict[str, Any] = {
@@ -132,12 +157,12 @@ def _row(spec: DatasetSpec, row: int) -> tuple[dict[str, Any], float]:
         "nodes": spec.nodes,
     }  # fmt: skip
     try:
-        path = row_path(spec, row)
+        path = row_path(spec, row, choose)
         path.check()
         content |= {"breaks": path.breaks, "coefficients": path.coefficients.ravel()}
         content |= {"length": path.length, "end": path.end}
         kept = copy > 0 and spec.relabel is Relabel.KEEP
-        solution = _clean_solution(spec, number) if kept else solve(spec, number, path)
+        solution = _clean_solution(spec, number, choose) if kept else solve(spec, number, path)
         content |= _label(path, solution, chosen)
         seconds = float(solution.stats.get("solve_seconds", np.nan))
     except CfplanError as error:
@@ -158,9 +183,9 @@ def solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
 
 
 @lru_cache(maxsize=1)
-def _clean_solution(spec: DatasetSpec, number: int) -> Solution:
+def _clean_solution(spec: DatasetSpec, number: int, choose: ChoosePath | None) -> Solution:
     """Return the clean path's label, cached for its copies, which are the next rows."""
-    return solve(spec, number, clean_path(spec, number))
+    return solve(spec, number, clean_path(spec, number, choose))
 
 
 def _label(path: Path, solution: Solution, chosen: LimitSet) -> dict[str, Any]:

@@ -133,7 +133,13 @@ def load_card(folder: Path) -> Card:
 
 
 def load_model(folder: Path) -> Model:
-    """Load a model and check it: the card's hash, and the names, shapes and finiteness of the weights.
+    """Load a model. Raises what load_weights() raises."""
+    card, weights = load_weights(folder)
+    return Model(card, NETWORKS[card.architecture](weights))
+
+
+def load_weights(folder: Path) -> tuple[Card, dict[str, NDArray]]:
+    """Load a model's weights and check them: the card's hash, and the names, shapes and finiteness of the weights.
 
     Raises:
         InputError: damaged or foreign weights, or a card of others.
@@ -154,7 +160,7 @@ def load_model(folder: Path) -> Model:
             "damaged, or not the weights that the card is of: their hashes differ", where=where, hint=_RESTORE
         )
     try:
-        weights = load(content)
+        weights: dict[str, NDArray] = load(content)
     except (SafetensorError, ValueError, KeyError) as error:
         raise InputError(f"not weights: {error}", where=where, hint=_RESTORE) from None
     expected = tensor_shapes(card.architecture, card.hidden, card.layers)
@@ -166,7 +172,7 @@ def load_model(folder: Path) -> Model:
         )
     if not all(values.dtype == np.float32 and (np.abs(values) < HEAVIEST).all() for values in weights.values()):
         raise InputError(f"some weights are not finite 32-bit numbers below {HEAVIEST:g}", where=where, hint=_RESTORE)
-    return Model(card, NETWORKS[card.architecture](weights))
+    return card, weights
 
 
 @cache

@@ -26,7 +26,7 @@ from cfplan.errors import InputError
 from cfplan.learning import features, inference
 from cfplan.learning.checkpoints import Epoch, draw_curves, resume, save_checkpoint
 from cfplan.learning.learned import Question, predict
-from cfplan.learning.model_files import Card, load_card, save_model
+from cfplan.learning.model_files import Card, load_card, load_weights, save_model
 from cfplan.learning.networks import Architecture, build
 from cfplan.learning.smooth import travel_time
 from cfplan.learning.training_set import Labels, TrainingSet, draw, read_training_set, split
@@ -58,6 +58,7 @@ class Options:
     rate: float = 2e-3  # the highest learning rate
     epsilon: float = 0.0  # m, noise injection: the paths of half the windows are perturbed by at most this
     seed: int = 0
+    start: Path | None = None  # model folder whose weights it starts from; None: random ones
 
     def __post_init__(self) -> None:
         wrong = [
@@ -92,8 +93,8 @@ def train(
     """Train, or resume the training in the folder, and write the model. Returns None in all processes but the first.
 
     Raises:
-        InputError: a dataset without usable rows, another training in the folder, a device that is not there, or
-            a loss that is not a number.
+        InputError: a dataset without usable rows, another training in the folder, a start of another architecture,
+            a device that is not there, or a loss that is not a number.
     """
     return train_on(read_training_set(dataset), folder, options, device=device, command=command, on_epoch=on_epoch)
 
@@ -140,7 +141,9 @@ class _Run:
         self.noise: tuple[int, Labels] | None = None
         torch.manual_seed(options.seed)
         self.network = build(options.architecture, options.hidden, options.layers)
-        self._normalise()
+        self.started = None if options.start is None else self._start_from(options.start)
+        if self.started is None:
+            self._normalise()
         self.network.to(place)
         self.parallel: Any = DistributedDataParallel(self.network) if world > 1 else self.network
         self.optimiser = torch.optim.AdamW(self.network.parameters(), lr=options.rate, weight_decay=1e-4)
@@ -207,8 +210,10 @@ class _Run:
         return save_model(self.folder, card, self._weights())
 
     def _ranges(self) -> dict[str, tuple[float, float]]:
-        """Return the range of each number without dimension that was learned from."""
+        """Return the range of each number without dimension that was learned from, by the start's training too."""
         numbers = self.seen.labels.numbers
+        if self.started is not None:
+            numbers = np.concatenate([numbers, np.array(list(self.started.ranges.values())).T])
         return {
             name: (round(float(low), 6), round(float(high), 6))
             for name, low, high in zip(features.NUMBERS, numbers.min(axis=0), numbers.max(axis=0), strict=True)
@@ -301,13 +306,25 @@ class _Run:
         self.network.mean.copy_(inputs.mean(dim=(0, 1)))
         self.network.scale.copy_(torch.where(spread > 1e-6, 1.0 / spread, torch.ones_like(spread)))
 
+    def _start_from(self, folder: Path) -> Card:
+        """Take over the weights of a model; return its card. Raises InputError where its network is another."""
+        card, weights = load_weights(folder)
+        for name in ("architecture", "hidden", "layers", "window"):
+            there, here = getattr(card, name), getattr(self.options, name)
+            if there != here:
+                raise InputError(
+                    f"{name} is {there} there, {here} here", where=str(folder), hint=f"give --{name} {there}"
+                )
+        self.network.load_state_dict({name: torch.from_numpy(values) for name, values in weights.items()})
+        return card
+
     def _weights(self) -> dict[str, NDArray]:
         return {name: values.detach().cpu().numpy() for name, values in self.network.state_dict().items()}
 
 
 def _plain(content: Any) -> dict[str, Any]:
-    """Return a dataclass as the card stores it: JSON has no tuples."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(content)))
+    """Return a dataclass as the card stores it: JSON has no tuples, and of a folder the name counts."""
+    plain: dict[str, Any] = json.loads(json.dumps(asdict(content), default=lambda folder: folder.name))
     return plain
 
 

@@ -4,6 +4,7 @@ __all__ = [
     "active_limits",
     "continuation",
     "figure",
+    "fleet",
     "path",
     "plan",
     "plan_file",

@@ -21,7 +21,7 @@ from cfplan.planners.expert.expert import refinements
 from cfplan.planners.expert.intersample import violates_at_nodes
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.lowering import lower_locally
-from cfplan.planning.plan_result import Plan
+from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.safety.certificate import Certificate, certify
 from cfplan.safety.slowing import Slowed, slow_until_certified
 from cfplan.safety.space import Space
@@ -185,6 +185,18 @@ def repair_plan(plan: Plan, profile: SpeedProfile, caps: SpeedCaps | None = None
         repair_speed_factor=plan.repair_speed_factor * repaired.speed_factor,
         joints=plan.joints if repaired.joints is None else repaired.joints,
     )
+
+
+def under_caps(
+    plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...], deadline: Deadline = NEVER
+) -> Plan:
+    """Return the plan under these caps, refined from the nearest one. `reasons` are those of LocalSlowing.
+
+    Raises as repair().
+    """
+    before = plan.slowing.before if plan.slowing else plan.trajectory.duration
+    repaired = repair_plan(plan, nearest.profile, caps, deadline)
+    return replace(repaired, slowing=LocalSlowing(caps, before, reasons))
 
 
 def _where_slower(before: SpeedProfile, after: SpeedProfile) -> tuple[float, float, float]:

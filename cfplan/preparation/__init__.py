@@ -6,6 +6,7 @@ __all__ = [
     "link_loss_assessment",
     "on_board_flight",
     "path_robustness",
+    "plan_fleet",
     "plan_flight",
     "prepare_flight",
     "small_flight",

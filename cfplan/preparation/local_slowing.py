@@ -6,7 +6,7 @@ under these caps from where it was; so the rest of the flight stays as fast as i
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InfeasibleError
 from cfplan.numbers import coordinates
-from cfplan.planning.plan_result import LocalSlowing, Plan
-from cfplan.planning.repair import repair_plan
+from cfplan.planning.plan_result import Plan
+from cfplan.planning.repair import under_caps
 from cfplan.safety.space import inside
-from cfplan.safety.speed_caps import SpeedCaps
+from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.simulation.link_loss import LinkLossMoments
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
@@ -83,9 +83,10 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
     assessed = assess(plan.trajectory)
     if _passed(assessed):
         return plan, assessed
-    slowed, reasons = plan, dict[str, None]()
+    slowed, reasons = plan, dict.fromkeys(plan.slowing.reasons if plan.slowing else ())
     places = _places(plan.profile)
-    caps = SpeedCaps.of(places, np.full(len(places), plan.limits.plan.speed))
+    slower = plan.slowing.caps if plan.slowing else None
+    caps = SpeedCaps.of(places, np.broadcast_to(allowed_speed(plan.limits.plan.speed, slower, places), places.shape))
     for done in range(ROUNDS):
         for each in assessed:
             reasons |= {f"{each.what} near {each.near(at)}": None for at in _worst_of_arcs(each)}
@@ -94,7 +95,7 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
             break
         lowest = np.min([each.speed for each in lower], axis=0)
         caps = SpeedCaps.of(places, lowest)
-        slowed = _replanned(plan, slowed, caps, tuple(reasons), deadline)
+        slowed = under_caps(plan, slowed, caps, tuple(reasons), deadline)
         assessed = assess(slowed.trajectory)
         if _passed(assessed):
             return _faster(plan, assess, (slowed, assessed), caps, deadline)
@@ -121,7 +122,7 @@ def _faster(
         between = np.sqrt(np.array(caps.speed) * np.maximum(highest, caps.speed))
         trial = SpeedCaps.of(places, np.where(raised, between, caps.speed))
         # From the slow one nothing would be gained.
-        faster = _replanned(plan, plan, trial, slowed.slowing.reasons, deadline)
+        faster = under_caps(plan, plan, trial, slowed.slowing.reasons, deadline)
         assessed = assess(faster.trajectory)
         if not _passed(assessed):
             for each in assessed:
@@ -180,9 +181,3 @@ def _places(profile: SpeedProfile) -> NDArray:
 def _speed_at(trajectory: Trajectory, s: NDArray) -> NDArray:
     """Return (K,) m/s."""
     return np.asarray(np.sqrt(trajectory.profile.at(s).h) * np.linalg.norm(trajectory.path(s, 1), axis=1))
-
-
-def _replanned(plan: Plan, nearest: Plan, caps: SpeedCaps, reasons: tuple[str, ...], deadline: Deadline) -> Plan:
-    """Return the plan under these caps, refined from the nearest one; its speed factor is kept."""
-    repaired = repair_plan(plan, nearest.profile, caps, deadline)
-    return replace(repaired, slowing=LocalSlowing(caps, plan.trajectory.duration, reasons))

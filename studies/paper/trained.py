@@ -93,7 +93,7 @@ TRAINING_COLUMNS = (
     _of_training("epochs", "epochs", spec=".0f"),
     _of_training("best", "best epoch", spec=".0f", meaning="its network is kept"),
     _of_training("loss", "loss", spec=".4f", meaning="of the last epoch, on the paths learned from"),
-    _of_training("unseen_loss", "validation loss", spec=".4f", meaning="of log h alone, of the best epoch"),
+    _of_training("unseen_loss", "validation loss", spec=".4f", meaning="of the best epoch"),
     Column("flat", "flat", meaning="trainings that ended because the validation loss was flat", of="seeds",
            value=lambda rows: len({row.training["seed"] for row in rows if row.training["flat"]})),
     _of_training("seconds", "training", "s", ".0f", meaning="of the processor, one thread"),

@@ -11,14 +11,17 @@ import numpy as np
 import pytest
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.path import Path as Curve
 from cfplan.geometry.path_families import Family
+from cfplan.geometry.path_file import PathShape
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import dataset
 from cfplan.learning.dataset import describe, label_shard, make_dataset, read_dataset, read_timing
 from cfplan.learning.dataset_spec import DatasetSpec, Labeller, Relabel, load_spec
 from cfplan.learning.labels import row_limits, row_path
 from cfplan.learning.workers import SchedulerError, pool
+from cfplan.planning.path.search import fastest_by_search
 from cfplan.safety.feasibility import infeasible_limit
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -153,11 +156,11 @@ def test_solve_times_are_kept_apart(made):
 def test_an_interrupted_run_goes_on_where_it_stopped(made, tmp_path, monkeypatch):
     labelled: list[int] = []
 
-    def label_until_interrupted(spec, number):
+    def label_until_interrupted(spec, number, choose=None):
         if len(labelled) == 1:
             raise KeyboardInterrupt
         labelled.append(number)
-        return label_shard(spec, number)
+        return label_shard(spec, number, choose)
 
     monkeypatch.setattr(dataset, "label_shard", label_until_interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -306,8 +309,48 @@ def test_toppquad_labels_the_same_paths(tmp_path):
         assert theirs == pytest.approx(ours, rel=0.03)
 
 
-def test_a_dataset_from_before_planners_were_named_is_the_experts(made, tmp_path):
+def test_chosen_paths_lead_through_the_same_waypoints_and_are_flown_sooner(tmp_path):
+    plain_spec = replace(SMALL, waypoints=(3, 4))
+    made = tmp_path / "plain", tmp_path / "chosen"
+    make_dataset(made[0], plain_spec)
+    make_dataset(made[1], replace(plain_spec, shape=PathShape.FASTEST), choose=fastest_by_search)
+    times = []
+    for plain, chosen in zip(*(read_dataset(folder)[1].to_pylist() for folder in made), strict=True):
+        assert chosen["status"] == "SOLVED"
+        paths = [Curve(np.array(row["breaks"]), np.array(row["coefficients"]).reshape(len(row["breaks"]) - 1, -1, 3))
+                 for row in (chosen, plain)]  # fmt: skip
+        ours, theirs = (path(path.breaks) for path in paths)
+        assert np.linalg.norm(ours[:, None] - theirs, axis=-1).min(axis=0).max() < 1e-9
+        times.append((chosen["travel_time"], plain["travel_time"]))
+    assert sum(ours for ours, _ in times) < 0.99 * sum(theirs for _, theirs in times)
+
+
+def test_shapes_and_rooms_are_drawn_by_seed_and_number():
+    rooms = []
+
+    def choose(points, space, chosen, yaw, angle):
+        assert space.holds(points)
+        rooms.append(space)
+        return min_snap(2.0 * points)
+
+    spec = DatasetSpec(count=60, seed=4, shape=None)
+    for number in range(60):
+        row_path(spec, number, choose)
+    assert 15 <= len(rooms) <= 45
+    heard, rooms = rooms, []
+    for number in range(60):
+        row_path(replace(spec, count=61), number, choose)
+    assert rooms == heard
+
+
+def test_chosen_paths_need_somebody_who_chooses_them(tmp_path):
+    """An error of the program: it must not become a row."""
+    with pytest.raises(ValueError, match="chooses"):
+        make_dataset(tmp_path, replace(SMALL, shape=PathShape.FASTEST))
+
+
+def test_a_dataset_from_before_planners_and_shapes_were_named_is_of_the_experts_least_snap(made, tmp_path):
     content = json.loads((made / "dataset.json").read_text())
-    del content["planner"]
+    del content["planner"], content["shape"]
     (tmp_path / "dataset.json").write_text(json.dumps(content))
     assert load_spec(tmp_path) == SMALL

@@ -98,6 +98,24 @@ def test_a_training_goes_on_for_more_epochs_and_ends_with_its_best_network(train
     assert card.scores["unseen_loss"] == pytest.approx(min(losses), rel=1e-3)
 
 
+def test_a_training_starts_from_the_weights_of_a_model(trained, tiny, tmp_path):
+    """At a rate of nearly nothing the first epoch is as good as the model, which a drawn network is not."""
+    folder, before = trained
+    still = replace(SMALL, epochs=1, rate=1e-9)
+    card = train(tiny, tmp_path / "started", replace(still, start=folder))
+    assert card.scores["unseen_loss"] == pytest.approx(before.scores["unseen_loss"], rel=1e-3)
+    assert card.training["start"] == folder.name
+    assert card.ranges == before.ranges
+    drawn = train(tiny, tmp_path / "drawn", still)
+    assert drawn.scores["unseen_loss"] > 1.5 * before.scores["unseen_loss"]
+
+
+def test_a_start_of_another_size_is_refused_naming_the_option(trained, tiny, tmp_path):
+    with pytest.raises(InputError, match="hidden is 6 there, 7 here") as error:
+        train(tiny, tmp_path, replace(SMALL, hidden=7, start=trained[0]))
+    assert error.value.hint == "give --hidden 6"
+
+
 @pytest.mark.parametrize("damage", [b"", b"nonsense"])
 def test_a_damaged_checkpoint_is_named(tiny, tmp_path, damage):
     (tmp_path / CHECKPOINT).write_bytes(damage)

@@ -1,22 +1,29 @@
 """The search for the fastest path through waypoints: where it starts, and how it is kept in the room."""
 
 import math
+from dataclasses import replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.deadline import Deadline
+from cfplan.deadline import NEVER, Deadline
+from cfplan.files.shipped import example_limits
 from cfplan.geometry.min_snap import centripetal_times
-from cfplan.geometry.path_file import PathFile
+from cfplan.geometry.path import Path
+from cfplan.geometry.path_file import PathFile, path_through
 from cfplan.geometry.waypoints import Gate
+from cfplan.geometry.yaw import YawMode
 from cfplan.planning.path.cost import Course, PathCost
 from cfplan.planning.path.descent import Cost, descend
 from cfplan.planning.path.detour import with_corners
 from cfplan.planning.path.room import Room
 from cfplan.planning.path.variables import Knots, variables_of, with_points_between
+from cfplan.safety.limit_sets import LimitSet
 from cfplan.safety.limits import Limits, PlanLimits
-from cfplan.safety.space import inside
+from cfplan.safety.limits_file import load_limits
+from cfplan.safety.space import Space, inside
 
 TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps improve it at last; steps at most
 LOOSE_TOLERANCE = 0.01  # the same of a first descent, by the length of the path
@@ -80,6 +87,21 @@ def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKno
         if inside(found.missed) or not found.finished:
             break
     return found
+
+
+def fastest_by_search(points: NDArray, space: Space, chosen: LimitSet, yaw: YawMode, yaw_angle: float) -> Path:
+    """Return the path that a search without a deadline finds through waypoints, (K, 3) m, as datasets have them.
+
+    The same on every machine that computes alike, as no clock and no network decides it.
+    """
+    path_file = replace(path_through(points), yaw=yaw, yaw_angle=yaw_angle)
+    limits = replace(_example_limits(), airframe=chosen.airframe, plan=chosen.limits, space=space)
+    return search(path_file, limits, NEVER).knots.path
+
+
+@cache
+def _example_limits() -> Limits:
+    return load_limits(example_limits())
 
 
 def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:

@@ -1,0 +1,65 @@
+"""Commands on a fleet file: plan, check and rehearse all vehicles together."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cfplan.cli import options
+from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from cfplan.preparation.plan_fleet import PlannedFleet
+
+
+def is_fleet(file: Path) -> bool:
+    """Return whether a file is a fleet file."""
+    from cfplan.planning.fleet.fleet_file import is_fleet_file
+
+    return is_fleet_file(file)
+
+
+def refuse_output(output: Path | None, figure: Path | None) -> None:
+    """Raise InputError for output files, each of which holds the plan of one vehicle."""
+    if output is not None or figure is not None:
+        raise InputError(
+            "a fleet has no plan file and no figure",
+            where=str(output or figure),
+            hint="leave -o and --figure out; --json prints starts, ends and distances",
+        )
+
+
+def plan_and_print(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> None:
+    """Plan a fleet, and print who starts when and how near each pair comes."""
+    fleet = _planned(file, safety_file, planning, steps)
+    if steps.as_json:
+        print_json(fleet.to_dict())
+    else:
+        _print_tables(fleet)
+
+
+def rehearse_and_print(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> None:
+    """Plan a fleet, make the dry run of each vehicle and lose its link; print what plan_and_print() does and these."""
+    fleet = _planned(file, safety_file, planning, steps)
+    with steps.waiting("loading simulator"):
+        from cfplan.preparation.plan_fleet import rehearse_fleet
+
+    rehearsed = rehearse_fleet(fleet, steps)
+    if steps.as_json:
+        print_json(fleet.to_dict() | {"dry_runs": {name: each.summary() for name, each in rehearsed.items()}})
+    else:
+        _print_tables(fleet)
+        rows = [(name, each.reason or "passed", each.expected()) for name, each in rehearsed.items()]
+        print_table("Dry runs", ["vehicle", "verdict", "largest deviation"], rows)
+
+
+def _planned(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> "PlannedFleet":
+    limits = options.read_limits(safety_file, file, steps)
+    with steps.waiting("loading planners"):
+        from cfplan.preparation.plan_fleet import plan_fleet
+
+    return plan_fleet(file, limits, options.flight_options(planning, safety_file, file), steps)
+
+
+def _print_tables(fleet: "PlannedFleet") -> None:
+    print_table("Vehicles", ["vehicle", "starts", "ends", "slower"], fleet.vehicle_rows())
+    print_table("Separation: passed", ["pair", "nearest", "allowed", "at", "where, m"], fleet.pair_rows())

@@ -1,0 +1,156 @@
+"""The fastest clock of one vehicle among others whose flights are known: when it starts, and how fast its clock runs.
+
+The vehicle stays on its path. With t the time of all and u that of its own plan, a clock is a curve u(t) whose slope is
+between 0 and 1, and which keeps out of the conflict map: the pairs (t, u) at which the vehicle is too near to another.
+Curves are searched on a grid: a rate is one of LEVELS quarters, changes by one quarter in RAMP ticks, and is 0 only at
+the start. Of the curves that end soonest, the one that is found waits as early as it can, at the start if possible.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.machine_code import njit
+
+TICK = 0.04  # s of the time of all, a multiple of the period of setpoints
+LEVELS = 4  # rates above 0
+CELL = TICK / LEVELS  # s of a plan's own time
+RAMP = 6  # ticks from one rate to the next: 1.04 /s, which from 2 m/s brakes by 2.1 m/s²
+_START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8  # how a state is reached: from rest, at the same, a lower, a higher rate
+
+
+class VehicleClock(NamedTuple):
+    """A clock of a vehicle, from the fleet's start to the end of its path."""
+
+    own: NDArray  # (N,) int, cells of its plan's own time at each tick
+    rate: NDArray  # (N,) of its clock, between 0 and 1
+
+    @property
+    def delay(self) -> float:
+        """Return how long it waits at its start, s."""
+        return TICK * float(np.argmax(self.rate > 0.0))
+
+    @property
+    def slows(self) -> bool:
+        """Return whether it is slowed on its way."""
+        return bool((self.rate[self.rate > 0.0] < 1.0).any())
+
+    def rate_at(self, own: NDArray) -> NDArray:
+        """Return the rate at each of its plan's own times, (N,) s."""
+        moving = self.rate > 0.0
+        return np.asarray(np.interp(own / CELL, self.own[moving], self.rate[moving]))
+
+
+class Stuck(NamedTuple):
+    """No clock leads to the end: how far the vehicle gets at most, and when."""
+
+    own: float  # s of its plan's own time
+    time: float  # s
+
+
+def cells_of(duration: float) -> NDArray:
+    """Return the own times, s, of a plan's cells, with as many behind its end as one tick passes."""
+    return CELL * np.arange(int(np.ceil(duration / CELL)) + LEVELS)
+
+
+def fastest_clock(own: NDArray, others: NDArray, apart: float) -> VehicleClock | Stuck:
+    """Return the clock that reaches the end soonest, `apart`, m, from all others.
+
+    `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan; `others`, (K, T, W, 2) m, are those of K
+    vehicles whose flights are known, at W moments of the skew about each tick until all rest.
+    """
+    conflict = _conflicts(own, others, apart)
+    how, end, cell, level = _reached(conflict)
+    if level > 0:
+        return VehicleClock(*_followed(how, end, cell, level))
+    found = how.any(axis=2)
+    farthest = int(np.flatnonzero(found.any(axis=0)).max(initial=0))
+    return Stuck(CELL * farthest, TICK * float(np.flatnonzero(found[:, farthest]).max(initial=0)))
+
+
+@njit(nogil=True, error_model="numpy")
+def _conflicts(own: NDArray, columns: NDArray, apart: float) -> NDArray:
+    """Return the conflict map, (T, U) bool."""
+    out = np.zeros((columns.shape[1], len(own)), dtype=np.bool_)
+    for k in range(columns.shape[0]):
+        for t in range(columns.shape[1]):
+            for w in range(columns.shape[2]):
+                x, y = columns[k, t, w, 0], columns[k, t, w, 1]
+                for u in range(len(own)):
+                    out[t, u] |= not (own[u, 0] - x) ** 2 + (own[u, 1] - y) ** 2 >= apart * apart
+    return out
+
+
+@njit(nogil=True, error_model="numpy")
+def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
+    """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the soonest end.
+
+    The level is 0 where no end is reached.
+    """
+    known, cells = conflict.shape
+    end = cells - LEVELS  # the first cell at the end
+    ticks = known + cells // LEVELS + LEVELS * RAMP
+    how = np.zeros((ticks, cells, LEVELS + 1), dtype=np.uint8)
+    stays = np.ones(ticks + 1, dtype=np.bool_)  # whether it may rest at its end from a tick on
+    for t in range(ticks - 1, -1, -1):
+        stays[t] = stays[t + 1] and _free(conflict, t, end)
+    for t in range(ticks):
+        if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, t, 0):
+            for level in range(LEVELS + 1):
+                how[t, 0, level] |= _START
+        for u in range(cells):
+            for level in range(LEVELS, 0, -1):
+                if how[t, u, level] == 0:
+                    continue
+                if u >= end:
+                    if stays[t]:
+                        return how, t, u, level
+                    continue
+                if t + 1 < ticks and _free(conflict, t + 1, u + level):
+                    how[t + 1, u + level, level] |= _SAME
+                for change in (-1, 1):
+                    if 1 <= level + change <= LEVELS and t + RAMP < ticks and u + _passed(level, change, RAMP) <= end:
+                        _ramp(how, conflict, t, u, level, change)
+    return how, 0, 0, 0
+
+
+@njit(error_model="numpy")
+def _ramp(how: NDArray, conflict: NDArray, t: int, u: int, level: int, change: int) -> None:
+    """Reach the state behind a change of rate from a state, unless it is in conflict on the way."""
+    for k in range(1, RAMP + 1):
+        if not _free(conflict, t + k, u + _passed(level, change, k)):
+            return
+    how[t + RAMP, u + _passed(level, change, RAMP), level + change] |= _FASTER if change < 0 else _SLOWER
+
+
+@njit(error_model="numpy")
+def _passed(level: int, change: int, ticks: int) -> int:
+    """Return the cells passed in the first ticks of a change of rate."""
+    return int(level * ticks + np.floor(change * ticks * ticks / (2.0 * RAMP) + 0.5))
+
+
+@njit(error_model="numpy")
+def _free(conflict: NDArray, t: int, u: int) -> bool:
+    """Return whether a state is out of conflict; behind the last tick of the map all others rest."""
+    return not conflict[min(t, len(conflict) - 1), u]
+
+
+@njit(error_model="numpy")
+def _followed(how: NDArray, t: int, u: int, level: int) -> tuple[NDArray, NDArray]:
+    """Return cells and rates at each tick up to an end, of the clock that waits as early as it can."""
+    own, rate = np.zeros(t + 1, dtype=np.int64), np.zeros(t + 1)
+    own[t], rate[t] = u, level / LEVELS
+    while u > 0:
+        ways = how[t, u, level]
+        if ways & _SAME and (level == LEVELS or not ways & _FASTER):
+            t, u = t - 1, u - level
+        else:
+            change = -1 if ways & _FASTER else 1
+            level -= change
+            t, u = t - RAMP, u - _passed(level, change, RAMP)
+            for k in range(1, RAMP):
+                own[t + k] = u + _passed(level, change, k)
+                rate[t + k] = (level + change * k / RAMP) / LEVELS
+        own[t], rate[t] = u, level / LEVELS
+    return own, rate

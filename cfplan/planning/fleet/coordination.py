@@ -1,0 +1,233 @@
+"""Coordinate a fleet: start delays and clock rates with which certified plans keep apart on their own paths.
+
+One vehicle after another gets the fastest clock among those before it. Which order is best is not known, so several are
+tried: the longest flight first; then with the one that was stuck, or that ended last, moved to the front; then others.
+A clock that only waits at the start is exact. One that slows on the way becomes speed caps, under which the path is
+planned again, so that all limits hold; what comes of it is measured against the others, not assumed.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import InfeasibleError
+from cfplan.geometry.random_paths import generator
+from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_of, fastest_clock
+from cfplan.planning.fleet.members import FleetMember, places
+from cfplan.planning.fleet.separation import Separation, separations
+from cfplan.planning.plan_result import Plan
+from cfplan.planning.repair import under_caps
+from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
+from cfplan.vehicle.trajectory import Trajectory
+
+ORDERS, TRIALS = 24, 6  # tried roughly, and of these made, the fastest first
+SLACKS = (0.02, 0.05, 0.1)  # m added to the distance that a search keeps, tried until the certificate passes
+_BETWEEN_SKEWS = 0.03  # s, at most, between the moments of the skew at which a search compares
+_LEAST_SPEED = 0.05  # m/s, of caps
+_PLACES = 0.02  # s of a plan from one place of its caps to the next
+
+
+Finish = Callable[[Plan], Plan]  # makes what was planned again ready to fly; raises InfeasibleError
+
+
+class Blocked(NamedTuple):
+    """Why no order was found: where one vehicle gets no farther for another."""
+
+    pair: tuple[str, str]
+    place: tuple[float, float]  # m, x and y, of the first
+    time: float  # s after the fleet's start
+
+    def __str__(self) -> str:
+        a, b = self.pair
+        x, y = self.place
+        return f"{b} blocks {a} at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s after the start"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Track:
+    """A flight among which a clock is sought."""
+
+    number: int
+    base: Trajectory  # the plan before coordination
+    clock: VehicleClock | None  # its clock, as sketched
+    member: FleetMember | None = None  # the flight, as made
+
+    @property
+    def end(self) -> float:
+        if self.member is not None:
+            return self.member.end
+        assert self.clock is not None
+        return TICK * (len(self.clock.own) - 1)
+
+    def own(self, times: NDArray) -> NDArray:
+        """Return the own time of the plan before coordination at times of all, s."""
+        if self.member is not None:
+            made = self.member.plan.trajectory
+            return self.base.time_at(made.s_at((times - self.member.delay).ravel())).reshape(times.shape)
+        assert self.clock is not None
+        return np.asarray(np.interp(times, TICK * np.arange(len(self.clock.own)), CELL * self.clock.own))
+
+    def columns(self, times: NDArray) -> NDArray:
+        """Return x and y at times of all, (..., 2) m."""
+        return places(self.base, self.own(times).ravel()).reshape(*times.shape, 2)
+
+
+def coordinate(
+    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish
+) -> tuple[FleetMember, ...] | Blocked:
+    """Return the members with delays and slower plans, whose columns stay `apart`, m, for clocks `skew`, s, apart.
+
+    `finish` is applied to each plan that is made slower, before it is compared with others.
+    """
+    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish)
+    found: list[tuple[float, tuple[int, ...]]] = []
+    blocked: Blocked | None = None
+    longest = max(member.plan.trajectory.duration for member in members)
+    orders = _Orders([member.plan.trajectory.duration for member in members])
+    for order in orders:
+        tracks = search.sketch(order)
+        if isinstance(tracks, Blocked):
+            blocked = blocked or tracks
+            orders.prefer(next(n for n in order if members[n].name == tracks.pair[0]))
+            continue
+        last = max(tracks, key=lambda track: track.end)
+        found.append((last.end, order))
+        if last.end <= longest + 2 * TICK:
+            break
+        orders.prefer(last.number)
+    for _, order in sorted(found)[:TRIALS]:
+        made = search.make(order)
+        if not isinstance(made, Blocked):
+            return made
+        blocked = blocked or made
+    assert blocked is not None
+    return blocked
+
+
+class _Orders:
+    """Orders to try, each once, the preferred ones first."""
+
+    def __init__(self, durations: list[float]):
+        self._next: tuple[int, ...] | None = tuple(np.argsort(-np.array(durations), kind="stable").tolist())
+        self._tried: list[tuple[int, ...]] = []
+
+    def __iter__(self) -> Iterator[tuple[int, ...]]:
+        assert self._next is not None
+        count, random = len(self._next), generator(0)
+        for _ in range(4 * ORDERS):
+            order, self._next = self._next or tuple(random.permutation(count).tolist()), None
+            if order not in self._tried:
+                self._tried.append(order)
+                yield order
+            if len(self._tried) == ORDERS:
+                return
+
+    def prefer(self, first: int) -> None:
+        """Try next the present order with a vehicle moved to the front."""
+        self._next = (first, *(number for number in self._tried[-1] if number != first))
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    """Members, what they must keep, and the search for their clocks in one order."""
+
+    members: tuple[FleetMember, ...]
+    apart: float  # m
+    skew: float  # s
+    at_rest: float  # m, from start to start and from end to end, which no clock changes
+    finish: Finish
+
+    def sketch(self, order: tuple[int, ...]) -> list[_Track] | Blocked:
+        """Return clocks in an order, without planning again."""
+        tracks: list[_Track] = []
+        for number in order:
+            clock = self._clock(number, tracks, SLACKS[0])
+            if isinstance(clock, Blocked):
+                return clock
+            tracks.append(_Track(number, self.members[number].plan.trajectory, clock))
+        return tracks
+
+    def make(self, order: tuple[int, ...]) -> tuple[FleetMember, ...] | Blocked:
+        """Return the members with the clocks of an order, each planned again where it is slowed."""
+        tracks: list[_Track] = []
+        for number in order:
+            made = self._track(number, tracks)
+            if isinstance(made, Blocked):
+                return made
+            tracks.append(made)
+        return tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+
+    def _track(self, number: int, tracks: list[_Track]) -> _Track | Blocked:
+        """Return the flight of a vehicle that keeps apart from the tracks of others."""
+        member = self.members[number]
+        blocked: Blocked | None = None
+        for slack in SLACKS:
+            clock = self._clock(number, tracks, slack)
+            if isinstance(clock, Blocked):
+                return blocked or clock
+            try:
+                made = _with_clock(member, clock, self.apart, self.finish)
+            except InfeasibleError:  # too slow for a profile, or what slowing does not make safe
+                slows = int(np.argmax((clock.rate > 0.0) & (clock.rate < 1.0)))
+                blocked = self._blocked(number, Stuck(CELL * float(clock.own[slows]), TICK * slows), tracks)
+                continue
+            nearest = _nearest(made, tracks, self.skew)
+            if nearest is None or nearest.keeps(self.apart):
+                return _Track(number, member.plan.trajectory, None, made)
+            blocked = Blocked(nearest.pair, nearest.place, nearest.time)
+        assert blocked is not None
+        return blocked
+
+    def _clock(self, number: int, tracks: list[_Track], slack: float) -> VehicleClock | Blocked:
+        """Return the fastest clock of a vehicle among the tracks of others."""
+        trajectory = self.members[number].plan.trajectory
+        own = places(trajectory, cells_of(trajectory.duration))
+        ticks = TICK * np.arange(
+            int(np.ceil((max((track.end for track in tracks), default=0.0) + self.skew) / TICK)) + 2
+        )
+        band = np.linspace(-self.skew, self.skew, 2 * int(np.ceil(self.skew / _BETWEEN_SKEWS)) + 1)
+        others = np.zeros((len(tracks), len(ticks), len(band), 2))
+        for row, track in zip(others, tracks, strict=True):
+            row[:] = track.columns(ticks[:, None] + band)
+        clock = fastest_clock(own, others, min(self.apart + slack, max(self.at_rest, self.apart)))
+        return clock if isinstance(clock, VehicleClock) else self._blocked(number, clock, tracks)
+
+    def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
+        """Return where a vehicle is stuck, and which of the others is nearest to where it would go."""
+        trajectory = self.members[number].plan.trajectory
+        (x, y), ahead = places(trajectory, np.array([stuck.own, stuck.own + TICK])).tolist()
+        then = np.array([stuck.time])
+        nearest = min(tracks, key=lambda track: float(np.linalg.norm(track.columns(then)[0] - ahead)))
+        return Blocked((self.members[number].name, self.members[nearest.number].name), (x, y), stuck.time)
+
+
+def _distance_at_rest(members: Sequence[FleetMember]) -> float:
+    """Return the least distance, m, from start to start or from end to end."""
+    ends = np.stack([member.plan.path(np.array([0.0, member.plan.path.end]))[:, :2] for member in members])
+    return min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(ends, 2)), default=np.inf)
+
+
+def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation | None:
+    """Return the nearest approach to the tracks of others; None where there are none."""
+    found = [separations((made, track.member), skew)[0] for track in tracks if track.member]
+    return min(found, key=lambda each: each.distance, default=None)
+
+
+def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:
+    """Return the member with a clock, planned again where that is slow. Raises InfeasibleError."""
+    if not clock.slows:
+        return replace(member, delay=clock.delay)
+    plan = member.plan
+    trajectory, slower = plan.trajectory, plan.slowing
+    own = np.linspace(0.0, trajectory.duration, int(np.ceil(trajectory.duration / _PLACES)) + 1)
+    s = np.concatenate([[0.0], trajectory.s_at(own[1:-1]), [plan.path.end]])
+    rate = clock.rate_at(own)
+    speed = np.sqrt(trajectory.profile.at(s).h) * np.linalg.norm(plan.path(s, 1), axis=1)
+    allowed = allowed_speed(plan.limits.plan.speed, slower.caps if slower else None, s)
+    caps = SpeedCaps.of(s, np.where(rate < 1.0, np.minimum(np.maximum(rate * speed, _LEAST_SPEED), allowed), allowed))
+    reasons = dict.fromkeys((*(slower.reasons if slower else ()), f"staying {apart:.2f} m from the other vehicles"))
+    return replace(member, plan=finish(under_caps(plan, plan, caps, tuple(reasons))), delay=clock.delay)

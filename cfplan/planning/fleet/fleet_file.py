@@ -1,0 +1,132 @@
+"""Fleet files: vehicles by name, each with its path, and the distance that they keep from each other.
+
+apart: 0.30          # m between the vertical columns of any two vehicles
+skew: 0.03           # s by which their clocks may differ
+vehicles:
+  left: {path: ../circle.yaml, place: {x: -1.0}}
+  right: {path: ../line.yaml, place: {x: 1.0, yaw_deg: 90}, uri: radio://0/80/2M/E7E7E7E702, body: cf2}
+"""
+
+import itertools
+import pathlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from cfplan.errors import InputError
+from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
+from cfplan.geometry.path_file import PathFile, PathPlace, load_path_file
+
+FEWEST, MOST = 2, 6  # vehicles
+APART = 0.30  # m: downwash is below 5 % of weight at 0.20 m, and each vehicle may be 0.05 m off its path
+SKEW = 0.03  # s
+_KEY = "vehicles"
+
+
+@dataclass(frozen=True, slots=True)
+class FleetVehicle:
+    """A vehicle of a fleet file, and the path that it flies."""
+
+    name: str
+    path_file: PathFile  # in its place in the room
+    uri: str = ""  # its address, as radio://0/80/2M/E7E7E7E701
+    body: str = ""  # its name in motion capture
+
+
+@dataclass(frozen=True, slots=True)
+class FleetFile:
+    """The content of a fleet file."""
+
+    name: str
+    vehicles: tuple[FleetVehicle, ...]
+    apart: float  # m, at least, between the vertical columns of any two vehicles
+    skew: float  # s, at most, by which clocks and orders to stop differ
+
+
+class _Vehicle(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    path: str
+    uri: str = ""
+    body: str = ""
+    place: PathPlace = PathPlace()
+
+
+class _Content(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
+    apart: float = Field(default=APART, ge=0.2, le=5.0)
+    skew: float = Field(default=SKEW, ge=0.0, le=0.2)
+    vehicles: dict[str, _Vehicle]
+
+
+def is_fleet_file(file: pathlib.Path) -> bool:
+    """Return whether a file lists vehicles; a file that cannot be read does not."""
+    if file.suffix.lower() not in (".yaml", ".yml") or not file.is_file():
+        return False
+    try:
+        return _KEY in read_plain(file)
+    except InputError:
+        return False
+
+
+def load_fleet_file(file: pathlib.Path) -> FleetFile:
+    """Read a fleet file and the path file of each vehicle.
+
+    Raises:
+        InputError: a mistake in it or in a path file; too few or too many vehicles; two with one address or one body;
+            two whose starts or whose ends are closer than they must keep apart.
+    """
+    content, places = read_yaml_with_places(file, _Content)
+    if not FEWEST <= len(content.vehicles) <= MOST:
+        raise InputError(
+            f"a fleet has {FEWEST} to {MOST} vehicles, not {len(content.vehicles)}",
+            where=places.where_key(_KEY),
+            hint="a single vehicle flies a path file" if len(content.vehicles) < FEWEST else "leave some out",
+        )
+    vehicles = tuple(_vehicles(content, file.parent, places))
+    fleet = FleetFile(content.name or file.stem, vehicles, content.apart, content.skew)
+    for a, b in itertools.combinations(vehicles, 2):
+        _check_pair(a, b, fleet, places)
+    return fleet
+
+
+def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterator[FleetVehicle]:
+    for name, each in content.vehicles.items():
+        if not name.isprintable() or not 0 < len(name) <= 40:
+            raise InputError(
+                "a vehicle's name has 1 to 40 printable characters",
+                where=places.where_key(_KEY, name),
+                hint="name it as on its label, as cf1",
+            )
+        source = folder / each.path
+        if not source.is_file():
+            raise InputError(
+                f"no such path file: {each.path!r}",
+                where=places.where(_KEY, name, "path"),
+                hint="the name is relative to the fleet file",
+            )
+        yield FleetVehicle(name, load_path_file(source).placed(*each.place.motion), each.uri, each.body)
+
+
+def _check_pair(a: FleetVehicle, b: FleetVehicle, fleet: FleetFile, places: Places) -> None:
+    """Raise InputError if two vehicles cannot be told apart, or cannot stand beside each other."""
+    for key in ("uri", "body"):
+        if getattr(a, key) and getattr(a, key) == getattr(b, key):
+            raise InputError(
+                f"{a.name} and {b.name} have the same {key}",
+                where=places.where(_KEY, b.name, key),
+                hint="give each vehicle its own",
+            )
+    for row, what in ((0, "start"), (-1, "end")):
+        (xa, ya, _), (xb, yb, _) = a.path_file.waypoints[row], b.path_file.waypoints[row]
+        distance = float(np.hypot(xa - xb, ya - yb))
+        if not distance >= fleet.apart:
+            raise InputError(
+                f"{a.name} and {b.name} {what} {distance:.2f} m from each other; they must keep {fleet.apart:g} m",
+                where=places.where(_KEY, b.name),
+                hint=f"move one of them with `place`, so that each {what}s under a free column of air",
+            )

@@ -1,0 +1,161 @@
+"""From a fleet file to certified plans that keep apart.
+
+fleet file → each vehicle's plan → start delays and clock rates → the certificate of every pair
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.planning.fleet.coordination import Blocked, coordinate
+from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
+from cfplan.planning.fleet.members import FleetMember
+from cfplan.planning.fleet.separation import Separation, separations
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
+from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
+from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import inside
+from cfplan.simulation.dry_run import DryRun
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedFleet:
+    """The plans of a fleet, and how far the vehicles stay from each other."""
+
+    name: str
+    apart: float  # m
+    skew: float  # s
+    members: tuple[FleetMember, ...]
+    separations: tuple[Separation, ...]  # of every pair, the nearest first
+    alone: float  # s, the longest plan before coordination
+    limits: Limits
+
+    @property
+    def end(self) -> float:
+        """Return when the last vehicle reaches its end, s after the fleet's start."""
+        return max(member.end for member in self.members)
+
+    @property
+    def flights(self) -> tuple[PlannedFlight, ...]:
+        """Return the flight of each vehicle, for rehearsing it; it begins after the member's delay."""
+        return tuple(PlannedFlight(member.name, member.plan, self.limits) for member in self.members)
+
+    def vehicle_rows(self) -> list[tuple[str, ...]]:
+        """Return a row of text per vehicle: name, start, end, what slows it."""
+        return [
+            (each.name, f"{each.delay:.2f} s", f"{each.end:.2f} s", each.plan.describe_slowing())
+            for each in self.members
+        ]
+
+    def pair_rows(self) -> list[tuple[str, ...]]:
+        """Return a row of text per pair: names, least distance, allowed distance, time, place."""
+        return [
+            (
+                " – ".join(each.pair),
+                f"{each.distance:.3f} m",
+                f"{self.apart:.3f} m",
+                f"{each.time:.2f} s",
+                f"{each.place[0]:.2f}, {each.place[1]:.2f}",
+            )
+            for each in self.separations
+        ]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the figures of the fleet, for JSON."""
+        vehicles = zip(self.members, self.flights, strict=True)
+        return {
+            "name": self.name,
+            "apart": self.apart,
+            "skew": self.skew,
+            "duration": self.end,
+            "slowest_alone": self.alone,
+            "vehicles": [flight.to_dict() | {"starts": each.delay, "ends": each.end} for each, flight in vehicles],
+            "pairs": [
+                {"pair": each.pair, "distance": each.distance, "place": each.place, "time": each.time}
+                for each in self.separations
+            ],
+        }
+
+
+def plan_fleet(
+    source: Path | FleetFile, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
+) -> PlannedFleet:
+    """Plan the path of each vehicle, and let them start later or fly slower where they would come too near.
+
+    Raises:
+        InputError: a file or an option is wrong.
+        InfeasibleError: a path has no certified plan, or no start delays and clock rates were found.
+        NotCertifiedError: a pair comes too near.
+    """
+    with step(on_step, "fleet") as results:
+        fleet = source if isinstance(source, FleetFile) else load_fleet_file(source)
+        results.append(f"{fleet.name}, {len(fleet.vehicles)} vehicles, {fleet.apart:g} m apart")
+    alone = []
+    for vehicle in fleet.vehicles:
+        with step(on_step, vehicle.name) as results:
+            try:
+                plan = plan_flight(vehicle.path_file, limits, options).plan
+            except InfeasibleError as error:
+                raise InfeasibleError(f"{vehicle.name}: {error.what}", where=error.where, hint=error.hint) from None
+            results.append(f"{vehicle.path_file.name}, {plan.trajectory.duration:.2f} s alone")
+            if plan.slowing:
+                results.append(plan.describe_slowing())
+        alone.append(FleetMember(vehicle.name, plan))
+    return coordinate_fleet(fleet.name, alone, limits, (fleet.apart, fleet.skew), on_step)
+
+
+def coordinate_fleet(
+    name: str, alone: Sequence[FleetMember], limits: Limits, keeps: tuple[float, float], on_step: OnStep = ignore_steps
+) -> PlannedFleet:
+    """Coordinate certified plans, and certify every pair.
+
+    `keeps` are the distance, m, and the skew, s. Raises InfeasibleError and NotCertifiedError as plan_fleet().
+    """
+    apart, skew = keeps
+    longest = max(member.plan.trajectory.duration for member in alone)
+    with step(on_step, "coordination") as results:
+        members = coordinate(alone, apart, skew, _given_way)
+        if isinstance(members, Blocked):
+            raise InfeasibleError(
+                f"no start delays and clock rates keep the vehicles {apart:g} m apart: {members}",
+                where=name,
+                hint="move that path with `place`, or give its waypoints another way round",
+            )
+        waiting = sum(member.delay > 0.0 for member in members)
+        slower = sum(new.plan is not old.plan for new, old in zip(members, alone, strict=True))
+        end = max(member.end for member in members)
+        results.append(f"{end:.2f} s together, {longest:.2f} s the slowest alone")
+        results.append(f"{waiting} wait at their start, {slower} fly slower")
+    with step(on_step, "separation") as results:
+        found = separations(members, skew)
+        results.append(f"nearest {found[0]}")
+        for each in found:
+            if not each.keeps(apart):
+                raise NotCertifiedError(
+                    f"{each}; they must keep {apart:g} m", where=name, hint="plan the fleet again, or move a path"
+                )
+    return PlannedFleet(name, apart, skew, members, found, longest, limits)
+
+
+def _given_way(plan: Plan) -> Plan:
+    return give_way(plan)[0]
+
+
+def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[str, DryRun]:
+    """Encode and rehearse each vehicle's flight, and lose its link at every setpoint; return the dry runs by name.
+
+    Raises NotCertifiedError where bytes, dry run or link loss do not pass. No vehicle is simulated in another's wash.
+    """
+    dry_runs = {}
+    for flight in fleet.flights:
+        with step(on_step, flight.name) as results:
+            encoded = encode_flight(flight)
+            dry_runs[flight.name] = rehearse(flight, encoded)
+            results.append(f"{len(encoded.payloads)} setpoints, deviation {dry_runs[flight.name].expected()}")
+            lost = find_link_loss(encoded, fleet.limits)
+            (results.append if inside(lost.beyond) else results.warn)(str(lost))
+    return dry_runs

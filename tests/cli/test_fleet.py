@@ -1,0 +1,49 @@
+"""Commands on fleet files: planned and checked together; what flies or saves one plan refuses them in words."""
+
+import pytest
+
+
+@pytest.fixture
+def fleet_file(tmp_path):
+    """Two short lines that cross."""
+    (tmp_path / "line.yaml").write_text("waypoints: [[-0.6, 0, 1], [0.6, 0, 1]]\nshape: min-snap\n")
+    file = tmp_path / "fleet.yaml"
+    file.write_text("vehicles:\n  a: {path: line.yaml}\n  b: {path: line.yaml, place: {yaw_deg: 90}}\n")
+    return file
+
+
+def test_a_fleet_is_planned_and_its_pairs_are_certified(cfplan, fleet_file, safety_file):
+    document = cfplan("plan", fleet_file, "--safety", safety_file(), "--json").json
+    (pair,) = document["pairs"]
+    assert pair["pair"] == ["a", "b"]
+    assert pair["distance"] >= document["apart"] == 0.3
+    assert document["duration"] >= document["slowest_alone"]
+    assert any(each["starts"] > 0.0 or each["slower_for"] for each in document["vehicles"])
+    assert all(each["certificate"]["passed"] for each in document["vehicles"])
+
+
+def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
+    ended = cfplan("check", fleet_file, "--safety", safety_file())
+    assert ended.code == 0
+    assert "Separation: passed" in ended.out
+    assert "a – b" in ended.out
+    assert "Dry runs" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "what"),
+    [
+        ("plan", ["-o", "a.parquet"], "no plan file"),
+        ("fly", ["--records", "."], "not flown yet"),
+        ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
+    ],
+)
+def test_what_is_of_one_vehicle_refuses_a_fleet(
+    cfplan, fleet_file, safety_file, tmp_path, monkeypatch, command, words, what
+):
+    monkeypatch.chdir(tmp_path)
+    ended = cfplan(command, fleet_file, "--safety", safety_file(), *words)
+    assert ended.code == 2
+    assert what in ended.err
+    assert "hint" in ended.err
+    assert not [file for file in tmp_path.iterdir() if file.suffix in (".parquet", ".csv")]

@@ -1,0 +1,112 @@
+"""Vehicles whose paths cross are kept apart, which a check that shares no code with the certificate finds too."""
+
+import math
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
+from cfplan.flight.setpoints.stops import stop_motion
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.fleet.coordination import Blocked, coordinate
+from cfplan.planning.fleet.members import FleetMember
+from cfplan.planning.fleet.separation import separations
+from cfplan.planning.plan import plan
+
+APART, SKEW = 0.30, 0.03
+WALLS = (-1.5, 1.5)
+
+
+@pytest.fixture(scope="module")
+def member(limits):
+    """Make a vehicle that flies through points, without looking at link loss."""
+
+    def make(name, *points):
+        planned = plan(min_snap(np.array(points, dtype=float)), limits.airframe, limits, planner="expert")
+        return FleetMember(name, planned)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def crossing(member):
+    """Three ways through the middle of the room, all of which would be there at once."""
+    low, high = WALLS
+    return (
+        member("east", (low, 0, 1), (high, 0, 1)),
+        member("north", (0, low, 1.2), (0, high, 1.2)),
+        member(
+            "aslant", (low / math.sqrt(2), low / math.sqrt(2), 0.8), (high / math.sqrt(2), high / math.sqrt(2), 0.8)
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def coordinated(crossing):
+    made = coordinate(crossing, APART, SKEW, lambda slower: slower)
+    assert not isinstance(made, Blocked)
+    return made
+
+
+def nearest(a, b, skew):
+    """The least distance of two columns, by the states of the trajectories at every 4 ms and six skews."""
+    times = np.arange(0.0, max(a.end, b.end) + 0.1, 0.004)
+    of_a = a.plan.trajectory.at(np.clip(times - a.delay, 0.0, a.plan.trajectory.duration)).position[:, :2]
+    least = math.inf
+    for late in np.linspace(-skew, skew, 6):
+        of_b = b.plan.trajectory.at(np.clip(times + late - b.delay, 0.0, b.plan.trajectory.duration)).position[:, :2]
+        least = min(least, float(np.linalg.norm(of_a - of_b, axis=1).min()))
+    return least
+
+
+def test_vehicles_that_start_together_come_too_near(crossing):
+    for each in separations(crossing, SKEW):
+        assert not each.keeps(APART)
+        assert np.linalg.norm(each.place) < 0.3  # in the middle of the room
+        assert 0.0 < each.time < crossing[0].end
+
+
+def test_the_certificate_is_never_above_the_dense_check_and_hardly_below(coordinated):
+    of_pair = {each.pair: each for each in separations(coordinated, SKEW)}
+    assert len(of_pair) == 3
+    for a, b in combinations(coordinated, 2):
+        certified = of_pair[a.name, b.name]
+        assert certified.keeps(APART)
+        dense = nearest(a, b, SKEW)
+        assert certified.distance <= dense < certified.distance + 0.02
+
+
+def test_coordinated_vehicles_keep_their_limits_and_lose_little_time(crossing, coordinated):
+    assert all(each.plan.certificate.passed for each in coordinated)
+    assert [each.plan.path for each in coordinated] == [each.plan.path for each in crossing]
+    alone = max(each.end for each in crossing)
+    assert alone <= max(each.end for each in coordinated) < 1.5 * alone
+
+
+def test_joint_stops_keep_apart_from_every_tick(coordinated, limits):
+    motions = [encode_trajectory(each.plan.trajectory, space=limits.space).motion for each in coordinated]
+    ticks = np.arange(0, int(max(each.end for each in coordinated) * RATE), 5)
+    places = []
+    for each, motion in zip(coordinated, motions, strict=True):
+        rows = np.clip(ticks - round(each.delay * RATE), 0, len(motion.position) - 1)
+        stops, _ = stop_motion(motion, rows, RATE)
+        places.append(stops.position.reshape(len(ticks), -1, 3)[..., :2])
+    for a, b in combinations(places, 2):
+        assert np.linalg.norm(a - b, axis=2).min() >= APART - 1e-3
+
+
+def test_a_wider_skew_needs_more_room(coordinated):
+    narrow, wide = separations(coordinated[:2], 0.0)[0], separations(coordinated[:2], 0.2)[0]
+    assert wide.distance < narrow.distance
+
+
+def test_vehicles_that_meet_on_one_line_are_refused_with_pair_place_and_time(member):
+    low, high = WALLS
+    head_on = member("east", (low, 0, 1), (high, 0, 1)), member("west", (high, 0.05, 1), (low, 0.05, 1))
+    blocked = coordinate(head_on, APART, SKEW, lambda slower: slower)
+    assert isinstance(blocked, Blocked)
+    assert set(blocked.pair) == {"east", "west"}
+    assert low <= blocked.place[0] <= high
+    assert blocked.place[1] == pytest.approx(0.0, abs=0.06)
+    assert math.isfinite(blocked.time)

@@ -1,0 +1,66 @@
+"""Fleet files: what they say, and what is refused before anything is planned."""
+
+import pytest
+
+from cfplan.errors import InputError
+from cfplan.geometry.path_file import load_path_file
+from cfplan.planning.fleet.fleet_file import is_fleet_file, load_fleet_file
+
+LINE = "waypoints: [[-1, 0, 1], [1, 0, 1]]\n"
+TWO = (
+    "vehicles:\n  a: {path: line.yaml, uri: 'sim://0', body: one}\n  b: {path: line.yaml, place: {y: 1, yaw_deg: 90}}\n"
+)
+
+
+@pytest.fixture
+def fleet_file(tmp_path):
+    """Write a fleet file beside a line."""
+    (tmp_path / "line.yaml").write_text(LINE)
+
+    def write(text: str):
+        file = tmp_path / "fleet.yaml"
+        file.write_text(text)
+        return file
+
+    return write
+
+
+def test_each_path_is_turned_and_moved_to_its_place(fleet_file):
+    fleet = load_fleet_file(fleet_file(TWO))
+    a, b = fleet.vehicles
+    assert (fleet.name, fleet.apart, fleet.skew) == ("fleet", 0.30, 0.03)
+    assert (a.name, a.uri, a.body) == ("a", "sim://0", "one")
+    assert a.path_file.waypoints[0] == pytest.approx([-1, 0, 1])
+    assert b.path_file.waypoints[0] == pytest.approx([0, 0, 1])
+    assert b.path_file.path(b.path_file.path.end) == pytest.approx([0, 2, 1])
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "line"),
+    [
+        (TWO.replace("y: 1, yaw_deg: 90", "y: 0.2"), "start 0.20 m from each other", 3),
+        (TWO.replace("y: 1, yaw_deg: 90", "x: 2, yaw_deg: 180"), "end 0.00 m", 3),
+        (TWO.replace("place", "uri: 'sim://0', place"), "same uri", 3),
+        (TWO.replace("place", "body: one, place"), "same body", 3),
+        (TWO.replace("path: line.yaml, place", "path: none.yaml, place"), "no such path file", 3),
+        ("".join(TWO.splitlines(keepends=True)[:2]), "2 to 6 vehicles, not 1", 1),
+        (TWO + "".join(f"  v{n}: {{path: line.yaml, place: {{y: {n}}}}}\n" for n in range(2, 7)), "not 7", 1),
+        ("apart: 0.1\n" + TWO, "apart", 1),
+        ("skew: 1\n" + TWO, "skew", 1),
+    ],
+)
+def test_a_fleet_that_cannot_be_flown_is_refused_with_its_place(fleet_file, text, what, line):
+    file = fleet_file(text)
+    with pytest.raises(InputError) as refused:
+        load_fleet_file(file)
+    assert what in refused.value.what
+    assert refused.value.where.startswith(f"{file}:{line}:")
+    assert refused.value.hint
+
+
+def test_a_fleet_file_is_told_from_a_path_file(fleet_file, tmp_path):
+    file = fleet_file(TWO)
+    assert is_fleet_file(file)
+    assert not is_fleet_file(tmp_path / "line.yaml")
+    with pytest.raises(InputError, match="a fleet file"):
+        load_path_file(file)
