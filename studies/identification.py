@@ -97,7 +97,7 @@ NEXT_COLUMNS = (
     Column("over_worst", "over known, worst", "cm", ".1f", value=largest("over_known")),
 )  # fmt: skip
 _ASKED = {"thrust": "1 %", "thrust over mass": "–", "mass": "1 %", "motor lag": "8 ms", "drag": "15 %",
-          "axial drag": "20 %", "roll moment": "10 %", "pitch moment": "10 %", "pose latency": "3 ms"}  # fmt: skip
+          "axial drag": "–", "pose latency": "3 ms"}  # fmt: skip
 
 
 def draw_vehicle(seed: int, nominal: Airframe) -> DrawnVehicle:
@@ -192,7 +192,6 @@ def _errors(found: Identification, drawn: DrawnVehicle, nominal: Airframe) -> tu
     """Return errors and stated uncertainties, in % or ms, by quantity."""
     true, quantities = drawn.airframe, found.quantities
     ratio, thrust = (true.thrust_scale / true.mass) / (nominal.thrust_scale / nominal.mass), true.thrust_scale
-    roll, pitch = true.velocity_moment
     truths = {
         "thrust": (quantities["thrust scale"], thrust, 100 / thrust),
         "thrust over mass": (quantities["thrust over mass"], ratio, 100 / ratio),
@@ -200,8 +199,6 @@ def _errors(found: Identification, drawn: DrawnVehicle, nominal: Airframe) -> tu
         "motor lag": (quantities["motor lag"], true.motor_time_constant, 1e3),
         "drag": (quantities["drag"], true.drag[0], 100 / true.drag[0]),
         "axial drag": (quantities["axial drag"], true.drag[1], 100 / true.drag[1]),
-        "roll moment": (quantities["roll moment"], roll, 100 / roll),
-        "pitch moment": (quantities["pitch moment"], pitch, 100 / pitch),
         "pose latency": (quantities["pose latency"], drawn.latency, 1e3),
     }
     errors = {name: scale * (quantity.value - truth) for name, (quantity, truth, scale) in truths.items()}
@@ -224,7 +221,7 @@ def _deviation(flown: SteppedFlight, mission: Mission) -> float:
 def tables(settings: Settings, rows: list[StudiedVehicle]) -> Iterator[Table]:
     """Yield the errors of identification, and the deviations of the next flights."""
     done = [vehicle for vehicle in rows if not vehicle.reason]
-    title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles"
+    title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles, moment ±{100 * MOMENT:.0f} %"
     yield table("errors", title, ERROR_COLUMNS, list(_accuracy(done)))
     yield table("next-flight", "The next flight", NEXT_COLUMNS, list(_next_flights(done)), by=("vehicle",))
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cfplan.errors import InputError
-from cfplan.identification.moment import fit_moments
 from cfplan.identification.signals import FlightSignals
 from cfplan.identification.translation import (
     AXIAL_DRAG,
@@ -36,7 +35,6 @@ _PLAUSIBLE = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as 
 _BEYOND_DOUBT = 2.0  # standard uncertainties
 _LARGE_MISFIT = 0.004  # m rms
 _TELLS_DRAG, _TELLS_LAG = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
-_TELLS_MOMENT, _SMALL_MOMENT = 0.2, 2e-5  # share of the value, or N m s/m where it is next to nothing
 _TELLS_BATTERY = 0.3  # V that the voltage must span
 
 
@@ -101,8 +99,7 @@ def assemble(
             f"the motion does not follow the motors: thrust over mass {ratio:.2f} times that of {before.name}",
             hint="is the body that was tracked the vehicle, and upright? `cfplan replay` shows both",
         )
-    found = _dynamics(solution, before, mass) | _moments(models, solution, before, mass)
-    found |= _latencies(models, solution) | _geometry(models, solution)
+    found = _dynamics(solution, before, mass) | _latencies(models, solution) | _geometry(models, solution)
     found["thrust per volt"] = _battery(models, solution, voltage)
 
     def told(name: str, otherwise: float) -> float:
@@ -115,10 +112,6 @@ def assemble(
         thrust_scale=found["thrust scale"].value,
         motor_time_constant=told("motor lag", before.motor_time_constant),
         drag=(max(told("drag", before.drag[0]), 0.0), max(told("axial drag", before.drag[1]), 0.0)),
-        velocity_moment=(
-            told("roll moment", before.velocity_moment[0]),
-            told("pitch moment", before.velocity_moment[1]),
-        ),
         source=_SOURCE + before.source.removeprefix(_SOURCE),
     )
     notes, latency = _notes(mass, before, solution.rms), found["pose latency"]
@@ -161,21 +154,6 @@ def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) ->
 def _full_thrust(airframe: Airframe) -> float:
     """Return the thrust of one motor, N, at the full command."""
     return airframe.motor_thrust_max * airframe.thrust_scale
-
-
-def _moments(
-    models: Sequence[FlightModel], solution: FittedUnknowns, before: Airframe, mass: float | None
-) -> dict[str, IdentifiedQuantity]:
-    weight = before.mass if mass is None else mass
-    fits = fit_moments(models, solution, float(np.linalg.norm(solution.linear[THRUST])) * weight)
-    found = {}
-    for name, fit, old in zip(("roll moment", "pitch moment"), fits, before.velocity_moment, strict=True):
-        vague = fit.value < 0.0 or fit.deviation > max(_TELLS_MOMENT * fit.value, _SMALL_MOMENT)
-        why = "too vague, kept as before: fly faster, or longer" if vague else ""
-        found[name] = IdentifiedQuantity(
-            f"{name} by velocity", fit.value, fit.deviation, "10⁻⁴ N m s/m", old, 2, why, scale=1e4
-        )
-    return found
 
 
 def _latencies(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
@@ -260,8 +238,8 @@ def _battery(models: Sequence[FlightModel], solution: FittedUnknowns, voltage: f
 
 def _notes(mass: float | None, before: Airframe, misfit: float) -> tuple[str, ...]:
     untold = (
-        "not told by these records: inertia, yaw torque per thrust, rotor reaction, lift with speed, curvature of "
-        "thrust; as in the airframe before"
+        "not told by these records: inertia, moment by velocity, yaw torque per thrust, rotor reaction, lift with "
+        "speed, curvature of thrust; as in the airframe before"
     )
     large = f"{1e3 * misfit:.1f} mm rms of motion are not explained: wind, a changed load or poses of bad quality?"
     always = (untold, large) if misfit > _LARGE_MISFIT else (untold,)

@@ -52,7 +52,7 @@ class FlightModel:
         """
         grid, signals = grid_of(self.signals), self.signals
         time = signals.pose_time - shift
-        along = np.einsum("nji,nj->ni", self.turn, self.velocity(grid, time))
+        along = np.einsum("nji,nj->ni", self.turn, self._velocity(grid, time))
         lift = signals.airframe.lift_with_speed * (along[:, :2] ** 2).sum(axis=1)
         thrust = lagged(self._command(delay, phase), lag) * (1.0 + lift)
         axial = along * [0.0, 0.0, 1.0]
@@ -81,8 +81,7 @@ class FlightModel:
             self._cache[key] = self.command.at(delay, phase)
         return self._cache[key]
 
-    def velocity(self, grid: NDArray, time: NDArray) -> NDArray:
-        """Return the poses' velocity, (G, 3) m/s, on the grid; `time`, s, is when they were taken."""
+    def _velocity(self, grid: NDArray, time: NDArray) -> NDArray:
         interval = float(np.median(np.diff(time)))
         slope = savgol_filter(self.signals.position, _VELOCITY_WINDOW, 3, deriv=1, delta=interval, axis=0)
         return _at(time, slope, grid)

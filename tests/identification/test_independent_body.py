@@ -9,13 +9,10 @@ from cfplan.identification.identify import fit_unknowns
 from cfplan.identification.quantities import assemble
 from cfplan.identification.signals import FlightSignals
 from cfplan.identification.translation import flight_model
-from cfplan.vehicle.airframe import MOTOR_TORQUE_SIGNS
 from cfplan.vehicle.airframes import AIRFRAMES
 
 NOMINAL = AIRFRAMES["crazyflie-2.1+"].simplified()
 MASS, THRUST_MAX, LAG, DRAG, AXIAL_DRAG = 0.0335, 0.113, 0.082, 0.0181, 0.0102
-JZ = NOMINAL.inertia[2]
-INERTIA, MOMENT = np.array([1.9e-5, 1.5e-5]), np.array([5.2e-4, 6.4e-4])  # about x and y
 ORIGIN, MOUNTING, LATE = np.array([0.006, -0.004, 0.012]), np.array([0.02, -0.03, 0.05]), 0.023
 HOVER = MASS * 9.81 / THRUST_MAX
 GYRO_BIAS, DURATION = np.array([0.005, -0.004, 0.003]), 20.0
@@ -46,21 +43,6 @@ def fly(liveliness):
     flown = solve_ivp(
         motion, (-0.5, DURATION + 0.5), [0, 0, 1, 0, 0, 0, HOVER], rtol=1e-9, atol=1e-9, dense_output=True
     )
-
-    def torque(time):
-        """What the motors hold about x and y: turning, and the moment of the air."""
-        step = 1e-4
-        turning = (rate(time + step) - rate(time - step))[:, :2] / (2 * step)
-        spin = rate(time)[:, [1, 0]] * rate(time)[:, 2:] * [JZ - INERTIA[1], INERTIA[0] - JZ]
-        along = attitude(time).inv().apply(flown.sol(time)[3:6].T)
-        return INERTIA * turning + spin + MOMENT * along[:, [1, 0]] * [-1.0, 1.0]
-
-    def commands(time):
-        step = 1e-3
-        leading = torque(time) + LAG * (torque(time + step) - torque(time - step)) / (2 * step)
-        apart = leading / (4 * NOMINAL.arm * THRUST_MAX) @ MOTOR_TORQUE_SIGNS[:2]
-        return command(time)[:, None] / 4 + apart
-
     chance = np.random.default_rng(3)
     seen, logged = np.arange(-0.2, DURATION + 0.2, 0.01), np.arange(-0.3, DURATION + 0.3, 0.02)
     markers = attitude(seen) * Rotation.from_rotvec(MOUNTING)
@@ -74,8 +56,7 @@ def fly(liveliness):
     return FlightSignals(
         airframe=NOMINAL, duration=DURATION, behind=0.010, pose_time=seen + LATE - 0.010, position=position,
         quaternion=noisy.as_quat(), status_time=logged, gyro=gyro,
-        command=commands(logged) + chance.normal(0.0, 0.02, (len(logged), 1)) * MOTOR_TORQUE_SIGNS[0],
-        voltage=np.linspace(3.9, 3.7, len(logged)),
+        command=np.repeat(command(logged)[:, None] / 4, 4, axis=1), voltage=np.linspace(3.9, 3.7, len(logged)),
         estimate_time=sent, estimate=still, sent_time=sent, setpoint=np.zeros((len(sent), 9)),
     )  # fmt: skip
 
@@ -89,7 +70,6 @@ def test_the_independent_body_is_found():
     found = identified(fly(1.0))
     quantities = found.quantities
     assert found.airframe.thrust_scale * NOMINAL.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.003)
-    assert found.airframe.velocity_moment == pytest.approx(tuple(MOMENT), rel=0.05)
     assert found.airframe.drag[0] == pytest.approx(DRAG, rel=0.03)
     assert found.airframe.drag[1] == pytest.approx(AXIAL_DRAG, rel=0.05)
     assert found.airframe.motor_time_constant == pytest.approx(LAG, abs=0.002)
@@ -104,9 +84,8 @@ def test_the_independent_body_is_found():
 
 def test_what_a_hover_cannot_tell_is_said_and_kept():
     found = identified(fly(0.0))
-    for name in ("motor lag", "drag", "axial drag", "roll moment", "pitch moment"):
+    for name in ("motor lag", "drag", "axial drag"):
         assert "too vague" in found.quantities[name].untold
     assert found.airframe.motor_time_constant == NOMINAL.motor_time_constant
     assert found.airframe.drag == NOMINAL.drag
-    assert found.airframe.velocity_moment == NOMINAL.velocity_moment
     assert found.airframe.thrust_scale * NOMINAL.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.01)

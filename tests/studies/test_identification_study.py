@@ -9,10 +9,7 @@ import pytest
 from cfplan.vehicle.airframes import AIRFRAMES
 from studies.identification import STUDY, Settings, StudiedVehicle, draw_vehicle
 
-QUANTITIES = (
-    "thrust", "thrust over mass", "mass", "motor lag", "drag", "axial drag", "roll moment", "pitch moment",
-    "pose latency",
-)  # fmt: skip
+QUANTITIES = ("thrust", "thrust over mass", "mass", "motor lag", "drag", "axial drag", "pose latency")
 SETTINGS = Settings(Path("identify.yaml"), Path("figure8.yaml"))
 NOMINAL = AIRFRAMES["crazyflie-2.1+"]
 
