@@ -197,7 +197,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
         planned = plan_flight(file, limits_for(file))
         encoded = encode_flight(planned)
         plan = planned.plan
-        bare = _without_drag(encoded, plan.trajectory)
+        bare = without_drag(encoded, plan.trajectory)
         row = JudgedFlight(
             path=file.stem,
             seed=seed,
@@ -217,7 +217,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
         return Prepared(JudgedFlight(file.stem, seed, str(error)))
 
 
-def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
+def without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
     """Return the same flight with accelerations and attitudes of the motion alone, without drag compensation."""
     times = encoded.times + LEAD
     states = trajectory.at(times)
