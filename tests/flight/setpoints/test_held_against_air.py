@@ -65,7 +65,7 @@ def test_a_vehicle_that_the_air_turns_follows_twice_as_closely(planned, limits, 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["line", "figure8", "slalom", "helix", "random", "trefoil"])
 def test_dry_runs_deviate_less_too(name, turned, limits):
-    """With the errors of the filter, and on vehicles that differ from their airframe: 2.4 to 3.4 against 3.4 to 5.5 cm."""
+    """Also with errors of the filter, on vehicles unlike their airframe: 2.4 to 3.4 cm against 3.4 to 5.5 cm."""
     flight = plan_flight(REPOSITORY / "flights" / f"{name}.yaml", turned)
     motion = flight.plan.trajectory
     astray, near = (dry_run(encoded(motion, each), motion, turned).deviation_median for each in (limits, turned))
