@@ -104,7 +104,9 @@ def fly_in_real_time(
     """
     refusals = 0
     while True:
-        flight = _fly_once(mission, conditions, name, view, on_stream, partial(pilot, mission), start)
+        flight = _fly_once(
+            mission, conditions, partial(pilot, mission), start, name=name, view=view, on_stream=on_stream
+        )
         flight.refusals = refusals
         if refusals == RETRIES or not _refused_for_lateness(flight.outcome):
             return flight
@@ -126,11 +128,12 @@ def _refused_for_lateness(outcome: FlightOutcome | None) -> bool:
 def _fly_once(
     mission: Mission,
     conditions: Conditions,
+    pilot: Callable[..., FlightOutcome],
+    start: Callable[[Mission, Conditions], Lab],
+    *,
     name: str,
     view: View | None,
     on_stream: Callable[[int], None],
-    pilot: Callable[..., FlightOutcome],
-    start: Callable[[Mission, Conditions], Lab],
 ) -> RealTimeFlight:
     flight = RealTimeFlight(None, "")
     header, phase = _header(mission, name), Phase.CLOSED

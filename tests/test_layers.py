@@ -205,3 +205,30 @@ def test_a_public_class_name_occurs_once():
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 places.setdefault(node.name, []).append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
     assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+MOST_PARAMETERS, MOST_LINES = 6, 60
+AS_THEY_ARE_CALLED = ("njit", "jitable", "click")  # compiled functions take arrays one by one, commands their options
+
+
+def functions():
+    """Yield (place, function) of cfplan and studies."""
+    for file in [*FILES, *STUDY_FILES]:
+        for node in nodes(file):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                yield f"{file}:{node.lineno} {node.name}", node
+
+
+def test_no_function_has_more_than_sixty_lines():
+    assert not [place for place, node in functions() if node.end_lineno - node.lineno >= MOST_LINES]
+
+
+def test_no_function_has_more_than_six_positional_parameters():
+    long = {}
+    for place, node in functions():
+        taken = [each.arg for each in (*node.args.posonlyargs, *node.args.args) if each.arg not in ("self", "cls")]
+        decorators = " ".join(map(ast.unparse, node.decorator_list))
+        if len(taken) > MOST_PARAMETERS and not any(word in decorators for word in AS_THEY_ARE_CALLED):
+            long[place] = taken
+    long = {place: taken for place, taken in long.items() if "_context" not in taken}  # called by numba itself
+    assert not long

@@ -34,7 +34,10 @@ def confirmed(prepared: "Prepared", uri: str, records: Path, *, yes: bool, speed
         )
     if not sys.stdin.isatty():
         raise InputError("not a terminal: cannot ask for confirmation", where=uri, hint="--yes")
-    return click.confirm("Fly?", err=True)
+    if click.confirm("Fly?", err=True):
+        return True
+    click.echo("not flown", err=True)
+    return False
 
 
 def describe(prepared: "Prepared", uri: str) -> str:

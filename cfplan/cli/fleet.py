@@ -18,13 +18,23 @@ def is_fleet(file: Path) -> bool:
     return is_fleet_file(file)
 
 
+def refuse_flight(file: Path) -> None:
+    """Raise InputError for a fleet file."""
+    if is_fleet(file):
+        raise InputError(
+            "fleets are planned and checked, but not flown yet",
+            where=str(file),
+            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
+        )
+
+
 def refuse_output(output: Path | None, figure: Path | None) -> None:
     """Raise InputError for output files, each of which holds the plan of one vehicle."""
     if output is not None or figure is not None:
         raise InputError(
-            "a fleet has no plan file and no figure",
+            "plan files and figures are not supported for fleets",
             where=str(output or figure),
-            hint="leave -o and --figure out; --json prints starts, ends and distances",
+            hint="omit -o and --figure; --json prints starts, ends and distances",
         )
 
 

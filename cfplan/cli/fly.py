@@ -104,12 +104,7 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    if fleet.is_fleet(path_or_plan):
-        raise InputError(
-            "fleets are planned and checked, but not flown yet",
-            where=str(path_or_plan),
-            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
-        )
+    fleet.refuse_flight(path_or_plan)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
@@ -119,7 +114,6 @@ def fly(
         prepare = _preparation(on_board, after, planning, uri)
         prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
-            click.echo("not flown", err=True)
             return int(ExitCode.ENDED_BY_OPERATOR)
         flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, flown, as_json)
@@ -140,7 +134,7 @@ def _preparation(
     if not after:
         return prepare
     _require_no_new_plan(planning)
-    return partial(_prepare_again, prepare, after, on_board, uri)
+    return partial(_prepare_again, prepare, after, on_board=on_board, uri=uri)
 
 
 def _require_no_new_plan(planning: dict[str, Any]) -> None:
@@ -150,14 +144,14 @@ def _require_no_new_plan(planning: dict[str, Any]) -> None:
     chosen += ["--planner"] if planning["planner"] != "auto" else []
     if chosen:
         raise InputError(
-            f"{chosen[0]} asks for a new plan, and --after flies that of the records", where="--after",
+            f"{chosen[0]} needs a new plan, but --after flies the plan of the records", where="--after",
             hint="leave one of them out",
         )  # fmt: skip
 
 
 def _prepare_again(
-    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], on_board: bool, uri: str,
-    path_or_plan: Path, limits: "Limits", flight_options: "FlightOptions", steps: Steps,
+    prepare: "Callable[..., Prepared]", after: tuple[Path, ...], path_or_plan: Path, limits: "Limits",
+    flight_options: "FlightOptions", steps: Steps, *, on_board: bool, uri: str,
 ) -> "Prepared":  # fmt: skip
     """Prepare the plan of earlier flights, corrected by what repeated in them."""
     from cfplan.identification.earlier_flights import earlier_flights, learn_correction
@@ -167,7 +161,7 @@ def _prepare_again(
         learned = learn_correction(earlier.flights)
         results.append(learned.describe())
         if earlier.uri != uri:
-            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle strays otherwise")
+            results.warn(f"flown by {earlier.uri}, not {uri}: another vehicle deviates differently")
     prepared = prepare(earlier.plan_file, limits, replace(flight_options, correction=learned.correction), steps)
     return replace(prepared, planned=replace(prepared.planned, name=earlier.name))
 
@@ -176,7 +170,7 @@ def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board:
     """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
     if after and lines is not None:
         raise InputError(
-            "waypoints that come in the air make a new plan", where="--after", hint="name the path of the records"
+            "waypoints received in flight make a new plan", where="--after", hint="name the path of the records"
         )
     if on_board and lines is not None:
         raise InputError(

@@ -17,7 +17,7 @@ from cfplan.cli.output import Steps, print_json, print_table
 def sim(path_or_plan: Path, safety_file: Path | None, as_json: bool, **planning: Any) -> None:
     """Rehearse a path or a plan file: its setpoints on drawn vehicles, by the firmware's filter and controller.
 
-    For a fleet file: rehearse each vehicle of the fleet.
+    For a fleet file: plan and certify the fleet, and rehearse each vehicle.
     """
     steps = Steps(as_json=as_json)
     if fleet.is_fleet(path_or_plan):

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     "--start",
     type=click.Path(path_type=Path),
     metavar="MODEL",
-    help="Model folder whose weights the training starts from.  [default: random weights]",
+    help="Model folder to take initial weights from.  [default: random weights]",
 )
 @click.option("--device", default="cpu", show_default=True, help="cpu or cuda; several GPUs under torchrun.")
 @options.as_json

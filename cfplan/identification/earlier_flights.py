@@ -155,7 +155,7 @@ def earlier_flights(folders: Sequence[Path], path_or_plan: Path, limits: Limits,
     for other, _, its_plan, _ in read:
         if not _same_motion(its_plan, plan):
             raise InputError(
-                "the plan is another than in the other records", where=str(other.folder),
+                "its plan differs from that of the other records", where=str(other.folder),
                 hint="name records of flights of one plan: the first flight, and those flown --after it",
             )  # fmt: skip
     _check_source(path_or_plan, record, file, plan)
@@ -171,7 +171,11 @@ def _read(folder: Path, limits: Limits, on_board: bool) -> tuple[Record, Path, P
     if not finished(record):
         raise InputError("its plan was not flown to the end", where=where, hint=_FLOWN_HINT)
     if (FLOWN in record.header.provenance) is not on_board:
-        how = ("streamed", "add --on-board only to flights on board") if on_board else ("on board", "add --on-board")
+        how = (
+            ("streamed", "omit --on-board: it is for records of flights on board")
+            if on_board
+            else ("on board", "add --on-board")
+        )
         raise InputError(f"it was flown {how[0]}", where=where, hint=how[1])
     asked = load_plan(record.folder / PLAN_FILE)
     corrected = record.folder / UNCORRECTED_FILE
@@ -206,7 +210,7 @@ def _check_source(path_or_plan: Path, record: Record, file: Path, plan: Plan) ->
         same = record.header.provenance.get(FINGERPRINT) == fingerprint(path_or_plan)
     if not same:
         raise InputError(
-            f"not what was flown in {record.folder}", where=str(path_or_plan),
+            f"does not match the plan flown in {record.folder}", where=str(path_or_plan),
             hint=f"to fly the plan of that flight again, name {file}",
         )  # fmt: skip
 

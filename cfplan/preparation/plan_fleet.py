@@ -123,13 +123,13 @@ def coordinate_fleet(
             raise InfeasibleError(
                 f"no start delays and clock rates keep the vehicles {apart:g} m apart: {members}",
                 where=name,
-                hint="move that path with `place`, or give its waypoints another way round",
+                hint="move that path with `place`, or reverse its waypoints",
             )
         waiting = sum(member.delay > 0.0 for member in members)
         slower = sum(new.plan is not old.plan for new, old in zip(members, alone, strict=True))
         end = max(member.end for member in members)
-        results.append(f"{end:.2f} s together, {longest:.2f} s the slowest alone")
-        results.append(f"{waiting} wait at their start, {slower} fly slower")
+        results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
+        results.append(f"waiting at the start: {waiting}, slowed: {slower}")
     with step(on_step, "separation") as results:
         found = separations(members, skew)
         results.append(f"nearest {found[0]}")

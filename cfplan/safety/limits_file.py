@@ -338,6 +338,12 @@ def _version(text: str) -> tuple[int, ...]:
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
     """Check the order of values within the file alone."""
+    _check_limits(content, places)
+    _check_space(content, places)
+    _check_vehicle(content, places)
+
+
+def _check_limits(content: _SafetyFile, places: Places) -> None:
     for section, key in (("plan", "tilt_deg"), ("flight", "stop_tilt_deg")):
         if (tilt := getattr(getattr(content, section), key)) < _QUARTER_TURN:
             raise InputError(
@@ -368,6 +374,9 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
                 where=places.where("plan", quantity.key),
                 hint=f"a flight as planned would be broken off: plan slower, or allow more in flight.{quantity.ladder}",
             )
+
+
+def _check_space(content: _SafetyFile, places: Places) -> None:
     for axis, (low, high) in enumerate(zip(content.space.low, content.space.high, strict=True)):
         if not high - low > 2 * content.space.margin:
             raise InputError(
@@ -377,6 +386,17 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             )
     for number, obstacle in enumerate(content.space.obstacles):
         _check_obstacle(obstacle, partial(places.where, "space", "obstacles", number))
+    height = content.ground.take_off_height
+    low, high, margin = content.space.low[2], content.space.high[2], content.space.margin
+    if not inside(max(low + margin - height, height - (high - margin))):
+        raise InputError(
+            f"a take-off to {height:g} m ends outside the space or within its margin",
+            where=places.where("ground", "take_off_height"),
+            hint=f"write a height from {low + margin:g} to {high - margin:g} m",
+        )
+
+
+def _check_vehicle(content: _SafetyFile, places: Places) -> None:
     if not content.battery.under_load < content.battery.at_rest:
         raise InputError(
             "battery.under_load must be below battery.at_rest",
@@ -407,14 +427,6 @@ def _check_order(content: _SafetyFile, places: Places) -> None:
             f"firmware.newest ({content.firmware.newest}) is older than firmware.oldest ({content.firmware.oldest})",
             where=places.where("firmware", "newest"),
             hint='write the newest that may fly, as "2026.08", or leave it out',
-        )
-    height = content.ground.take_off_height
-    low, high, margin = content.space.low[2], content.space.high[2], content.space.margin
-    if not inside(max(low + margin - height, height - (high - margin))):
-        raise InputError(
-            f"a take-off to {height:g} m ends outside the space or within its margin",
-            where=places.where("ground", "take_off_height"),
-            hint=f"write a height from {low + margin:g} to {high - margin:g} m",
         )
 
 

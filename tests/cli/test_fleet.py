@@ -33,7 +33,7 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
 @pytest.mark.parametrize(
     ("command", "words", "what"),
     [
-        ("plan", ["-o", "a.parquet"], "no plan file"),
+        ("plan", ["-o", "a.parquet"], "plan files and figures are not supported"),
         ("fly", ["--records", "."], "not flown yet"),
         ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
     ],

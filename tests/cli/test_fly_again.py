@@ -159,7 +159,7 @@ def test_another_path_is_refused_and_the_plan_named(first, cfplan, path_file):
     text = (REPOSITORY / "flights" / "line.yaml").read_text()
     ended = cfplan("fly", path_file(text + "speed: 0.9\n"), "--after", folder)
     assert ended.code == 2
-    assert "not what was flown" in ended.err
+    assert "does not match the plan flown" in ended.err
     assert str(folder / "plan.parquet") in ended.err
 
 

@@ -38,8 +38,8 @@ REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs" / "export.md").read_text()
 FLIGHTS = sorted(file.stem for file in (REPOSITORY / "flights").glob("*.yaml"))
 TOO_LONG = ("lissajous", "scan")  # for the 31 pieces that Crazyswarm uploads
-QUICK = ("line", "slalom")
-REPEATS = 5  # flights of the others: one strays by chance half a centimetre more than another
+QUICK = ("line",)
+FLIGHTS_EACH = 5  # a single one strays by chance half a centimetre more than another
 COARSELY = {("identify", "by_crazyswarm"): 0.03}  # m: 31 raw pieces follow its 30 s to 17 mm, and leave no correction
 WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed
 HEIGHT = 0.8  # m, of take-off
@@ -224,11 +224,7 @@ def planned(name: str) -> PlannedFlight:
 
 @cache
 def streamed(name: str) -> float:
-    return statistics.fmean(streamed_deviation(planned(name), seed) for seed in range(repeats(name)))
-
-
-def repeats(name: str) -> int:
-    return 1 if name in QUICK else REPEATS
+    return statistics.fmean(streamed_deviation(planned(name), seed) for seed in range(FLIGHTS_EACH))
 
 
 @pytest.mark.parametrize(
@@ -244,7 +240,7 @@ def test_an_export_flies_by_the_script_of_the_page(tmp_path, monkeypatch, name, 
     monkeypatch.chdir(tmp_path)
     exported = fit_polynomials(planned(name), form)
     write_polynomials(exported, form, tmp_path / ("circle.bin" if form is Form.MEMORY else "circle.csv"))
-    flown = statistics.fmean(exported_deviation(exported.on_board, fly, seed) for seed in range(repeats(name)))
+    flown = statistics.fmean(exported_deviation(exported.on_board, fly, seed) for seed in range(FLIGHTS_EACH))
     print(f"{name} {fly.__name__}: {100 * flown:.1f} cm, {100 * streamed(name):.1f} cm streamed")
     assert flown < streamed(name) + COARSELY.get((name, fly.__name__), WORSE)
 

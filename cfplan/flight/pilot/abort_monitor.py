@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -31,7 +31,7 @@ class Observation:
     now: float  # s
     pose: Pose | None = None  # the last good one
     pose_fault: str = ""  # why none has come since
-    health: Health = Health()  # noqa: RUF009  it is frozen
+    health: Health = field(default_factory=Health)
     wanted: Triple | None = None
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None  # None while its log is gone

@@ -253,8 +253,6 @@ def _run(
         signal.signal(number, signal.SIG_IGN)
     logging.getLogger("cflib").setLevel(logging.CRITICAL)  # its warnings are reported as telemetry
     warnings.filterwarnings("ignore", module="cflib")
-    import cflib.crazyflie  # noqa: F401  connecting needs it, and it takes long
-
     try:
         assignment: _Assignment = orders_connection.recv()
     except (EOFError, OSError):

@@ -308,7 +308,8 @@ def _off(first: Vector, second: Vector) -> float:
 def _angle(first: Matrix, second: Matrix) -> float:
     """Return the angle, rad, between rotations: ‖A - B‖² = 8 sin²(angle / 2)."""
     total = 0.0
-    for a, b in zip(first, second):  # noqa: B905, as numba knows no strict zip
+    for row in range(3):
+        a, b = first[row], second[row]
         x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
         total += x * x + y * y + z * z
     return 2.0 * math.asin(min(math.sqrt(total / 8.0), 1.0))

@@ -23,7 +23,9 @@ _WIDTH = min(LANES, vector_width())  # points at once
 _VALUES, _DERIVATIVES = 0, 1  # of derivatives.point_kernels()
 
 
-def _compute(_context: Any, free_yaw: Any, which: Any, first: Any, points: Any, inputs: Any, results: Any) -> Any:
+def _compute(  # numba asks for each argument of _evaluate by itself
+    _context: Any, free_yaw: Any, which: Any, first: Any, points: Any, inputs: Any, results: Any
+) -> Any:
     """Evaluate one of derivatives.point_kernels(free_yaw) at _WIDTH of the points, from the `first` on."""
     from cfplan.planners.expert import derivatives, vector_code
 

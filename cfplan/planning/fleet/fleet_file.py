@@ -100,7 +100,7 @@ def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterat
             raise InputError(
                 "a vehicle's name has 1 to 40 printable characters",
                 where=places.where_key(_KEY, name),
-                hint="name it as on its label, as cf1",
+                hint="use the name on its label, such as cf1",
             )
         source = folder / each.path
         if not source.is_file():

@@ -37,9 +37,9 @@ def read(file: Path, rotations: Rotations | None = None) -> MocapLog:
     rates: dict[str, None] = {}
     assumed: list[str] = []
     origin, truncated = None, False
-    first = _LEADING.match(data).end()  # type: ignore[union-attr]  # it always matches
+    first = _matched(_LEADING, data, 0, len(data)).end()
     for begin, end in pairwise([first, *(match.end() for match in _SECTION.finditer(data, first)), len(data)]):
-        head: re.Match[bytes] = _FIVE_LINES.match(data, begin, end)  # type: ignore[assignment]  # it always matches
+        head = _matched(_FIVE_LINES, data, begin, end)
         lines = head[0].decode("utf-8", errors="replace").removesuffix("\n").split("\n")
         section = read_head(lines, where=f"{file}:{line_at(data, begin)}", rotations=rotations)
         notes += [f"left out, as it holds no pose: {name}" for name in section.left_out]
@@ -92,3 +92,10 @@ def _subject(group: Group, table: Table, where: str) -> LoggedSubject:
             hint="the unit over its columns is wrong; export it again",
         )
     return found
+
+
+def _matched(pattern: re.Pattern[bytes], data: bytes, begin: int, end: int) -> re.Match[bytes]:
+    """Return the match of a pattern that matches anything."""
+    match = pattern.match(data, begin, end)
+    assert match is not None
+    return match
