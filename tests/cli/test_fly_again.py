@@ -117,7 +117,7 @@ def test_the_second_flight_stays_nearer_to_the_plan_and_the_third_no_farther(pat
         assert cfplan("check", folder).code == 0  # what was sent is what the record's plan says
     header = read_record(third).header
     assert np.abs(header.shift).max() == pytest.approx(0.07, abs=0.03)
-    assert header.name == "figure-eight"
+    assert header.name == "figure eight"
 
 
 @pytest.mark.slow
