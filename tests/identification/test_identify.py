@@ -7,6 +7,7 @@ import pytest
 from one_body import stepped
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.identification.advice import deviation_per_speed, suggests_identification
 from cfplan.identification.airframe_yaml import airframe_text, safety_lines, write_airframe
 from cfplan.identification.identify import identify
@@ -190,9 +191,9 @@ def test_a_file_is_overwritten_only_by_force(found, tmp_path):
 
 
 def test_deviation_that_grows_with_speed_suggests_identification(record):
-    poses = record.poses
-    wanted = np.column_stack([np.interp(poses.time, record.setpoints.due, p) for p in record.setpoints.position.T])
-    moving = np.column_stack([np.interp(poses.time, record.setpoints.due, v) for v in record.setpoints.velocity.T])
+    poses, planned = record.poses, record.setpoints.due + LEAD
+    wanted = np.column_stack([np.interp(poses.time, planned, p) for p in record.setpoints.position.T])
+    moving = np.column_stack([np.interp(poses.time, planned, v) for v in record.setpoints.velocity.T])
     noise = np.random.default_rng(2).normal(0.0, 0.01, wanted.shape)
     on_time = replace(record, poses=replace(poses, position=wanted + noise))
     late = replace(record, poses=replace(poses, position=wanted + noise - 0.03 * moving))
