@@ -18,11 +18,13 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
+    TUBE_PART,
     foreseen_link_loss,
     link_loss_at_every_setpoint,
     link_loss_at_walls,
     link_loss_near_walls,
     link_loss_of_slow_motion,
+    link_loss_tubes,
     link_loss_within_stops,
     simulate_link_loss,
 )
@@ -289,6 +291,26 @@ def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):
     lost = simulate_link_loss(line.payloads, limits)
     assert lost.beyond < 0.0
     assert lost.distance < 1.2
+
+
+def test_a_tube_holds_the_vehicle_at_each_time_and_sweeps_what_the_whole_fall_sweeps(line, limits):
+    rows = np.arange(0, len(line.payloads), 40)
+    tubes, whole = link_loss_tubes(line.payloads, limits, rows), link_loss_at_every_setpoint(line.payloads, limits)
+    low, high = tubes[..., 0, :].min(axis=(0, 2)), tubes[..., 1, :].max(axis=(0, 2))
+    assert np.all(low <= whole.low[rows])
+    assert np.all(high >= whole.high[rows])
+    assert np.abs(low - whole.low[rows]).max() < 0.03  # the accelerometer that reads too much
+    assert np.abs(high - whole.high[rows]).max() < 0.03
+    assert not np.any(tubes[:, :, -1, 1, 2])  # it lies
+    lag = limits.airframe.motor_time_constant
+    for at in range(0, len(rows), 3):
+        for tube, times in zip(tubes[:, at], ({"off_after": 0}, {"off_after": 1040}), strict=True):
+            places = fly_on(line.payloads, limits.airframe, int(rows[at]), lag=lag, **times)
+            part = np.minimum((np.arange(len(places)) + 1) // TUBE_PART, len(tube) - 1)
+            assert np.all(places >= tube[part, 0] - 0.01)
+            assert np.all(places <= tube[part, 1] + 0.01)
+            assert np.all(places[-1, :2] >= tube[-1, 0, :2] - 0.01)
+            assert np.all(places[-1, :2] <= tube[-1, 1, :2] + 0.01)
 
 
 def test_the_virtual_crazyflie_goes_there_too(line, limits):
