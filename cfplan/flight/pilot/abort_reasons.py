@@ -35,6 +35,12 @@ class AbortReason(Enum):
         "restart the vehicle before the next flight",
         ExitCode.ENDED_BY_OPERATOR,
     )
+    FLEET_BRAKES = (
+        "the fleet brakes: {reason}",
+        "Vehicles of a fleet brake and land together: another one left its plan, does not answer or came too near, or "
+        "the process that conducts them is silent.",
+        "look at the vehicle that ended first",
+    )
     MAIN_PROCESS_GONE = (
         "the main process is gone",
         "The terminal was closed or the command was killed. The pilot is a separate process and landed the vehicle.",

@@ -70,6 +70,7 @@ def begin_take_off(
 
     `way_between` two places makes setpoints. Raises PreflightError where the vehicle may not fly.
     """
+    loop.await_clearance(Phase.TAKE_OFF)
     loop.history.enter(Phase.TAKE_OFF)
     height, (x, y, _) = loop.mission.take_off_height, loop.pose().position
     yaw = yaw_of(loop.pose().quaternion)
