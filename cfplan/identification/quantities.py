@@ -93,7 +93,7 @@ def assemble(
 ) -> Identification:
     """Return the figures of a fit, and the airframe with those that the records tell."""
     before = models[0].signals.airframe
-    ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / before.motor_thrust_max
+    ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / _full_thrust(before)
     if not _PLAUSIBLE_RATIO[0] <= ratio <= _PLAUSIBLE_RATIO[1]:
         raise InputError(
             f"the motion does not follow the motors: thrust over mass {ratio:.2f} times that of {before.name}",
@@ -105,13 +105,11 @@ def assemble(
     def value_or(name: str, otherwise: float) -> float:
         return otherwise if found[name].unobservable_reason else found[name].value
 
-    scale = found["thrust scale"].value
     airframe = replace(
         before,
         name=f"{before.name.removesuffix(', identified')}, identified",
         mass=found["mass"].value,
-        motor_thrust_min=before.motor_thrust_min * scale,
-        motor_thrust_max=before.motor_thrust_max * scale,
+        thrust_scale=found["thrust scale"].value,
         motor_time_constant=value_or("motor lag", before.motor_time_constant),
         drag=(max(value_or("drag", before.drag[0]), 0.0), max(value_or("axial drag", before.drag[1]), 0.0)),
         source=_SOURCE + before.source.removeprefix(_SOURCE),
@@ -128,7 +126,7 @@ def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) ->
     std = math.sqrt(direction @ covariance[THRUST, THRUST] @ direction) / thrust
     std = math.hypot(std, _THRUST_STD / (before.mass * GRAVITY))
     weight = before.mass if mass is None else mass
-    ratio = thrust / (before.motor_thrust_max / before.mass)
+    ratio = thrust / (_full_thrust(before) / before.mass)
     scale = thrust * weight / before.motor_thrust_max
     held = "held: flights determine only thrust over mass; weigh the vehicle and give --mass" if mass is None else ""
     lag, lag_std = solution.lag, math.sqrt(covariance[LINEAR, LINEAR])
@@ -143,12 +141,19 @@ def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) ->
     return {
         "thrust over mass": IdentifiedQuantity("thrust over mass, relative", ratio, ratio * std, "", 1.0, 4),
         "mass": IdentifiedQuantity("mass", weight, math.nan, "g", before.mass, 2, held, scale=1e3),
-        "thrust scale": IdentifiedQuantity("thrust scale", scale, scale * std, "", 1.0, 4, remark=remark),
+        "thrust scale": IdentifiedQuantity(
+            "thrust scale", scale, scale * std, "", before.thrust_scale, 4, remark=remark
+        ),
         "motor lag": IdentifiedQuantity(
             "motor lag", lag, lag_std, "ms", before.motor_time_constant, 1, too_uncertain, scale=1e3
         ),
         **drags,
     }
+
+
+def _full_thrust(airframe: Airframe) -> float:
+    """Return the thrust of one motor, N, at the full command."""
+    return airframe.motor_thrust_max * airframe.thrust_scale
 
 
 def _latencies(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
@@ -237,7 +242,8 @@ def _battery(models: Sequence[FlightModel], solution: FittedUnknowns, voltage: f
 
 def _notes(mass: float | None, before: Airframe, misfit: float) -> tuple[str, ...]:
     unobservable_reason = (
-        "not observable in these records: inertia, yaw torque per thrust, rotor reaction; as in the airframe before"
+        "not observable in these records: inertia, moment by velocity, yaw torque per thrust, rotor reaction, lift "
+        "with speed, curvature of thrust; as in the airframe before"
     )
     large = f"{1e3 * misfit:.1f} mm rms of motion are not explained: wind, a changed load or poses of bad quality?"
     always = (unobservable_reason, large) if misfit > _LARGE_MISFIT else (unobservable_reason,)

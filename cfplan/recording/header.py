@@ -88,7 +88,7 @@ def header_under(
         uri=uri,
         planner=planner,
         vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        thrust_at_full_command=limits.airframe.motor_thrust_max * limits.airframe.thrust_scale,
         plan_limits=limits.plan,
         bounds=bounds,
         travel_time=travel_time,

@@ -525,6 +525,6 @@ def _check_vehicle_can(limits: Limits, places: Places) -> None:
 
 def _quickest_turn(airframe: Airframe) -> float:
     """Return the largest angular acceleration, rad/s², of motors at the ends of their range."""
-    ends = product((airframe.motor_thrust_min, airframe.motor_thrust_max), repeat=4)
+    ends = product(airframe.thrust_range, repeat=4)
     turns = airframe.mixing[1:] @ np.array(list(ends)).T / np.array(airframe.inertia)[:, None]
     return float(np.linalg.norm(turns, axis=0).max())

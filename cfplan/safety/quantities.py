@@ -121,7 +121,7 @@ QUANTITIES = (
     Quantity(
         "motor thrust, most", "N", "motor_thrust_max", "motor_reserve", AT_MOST, measures.MOTOR_THRUST, 4, jumps=True,
         remedy="choose a stronger vehicle or a smaller reserve",
-        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.motor_thrust_max,
+        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.thrust_range[1],
     ),
     Quantity(
         "motor thrust, least", "N", "motor_thrust_min", "motor_reserve", AT_LEAST, measures.MOTOR_THRUST, 4, jumps=True,

@@ -176,7 +176,7 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.
     gains = gains_for(planned)
     # Hover has lasted too short for the controller's integral, of some 25 s, to take off what weight and thrust are
     # other than it was told.
-    sunk = GRAVITY * (drawn.mass / drawn.thrust_scale - planned.mass) / gains.kp_z
+    sunk = GRAVITY * (drawn.mass * planned.thrust_scale / drawn.thrust_scale - planned.mass) / gains.kp_z
     start = hovering(drawn, flight.wanted_at(np.zeros(1))[0] - [0.0, 0.0, sunk], flight.yaw)
     steps = round(flight.duration / TIME_STEP) + 1
     arrivals = np.arange(draw.pose_phase, min(flight.duration + TIME_STEP, lost), 1.0 / limits.pose.rate)

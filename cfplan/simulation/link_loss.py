@@ -36,12 +36,13 @@ from cfplan.simulation.engine.layout import (
     pack_airframe,
     setpoint_rows,
 )
-from cfplan.simulation.engine.run import NEVER, Schedule, Vehicles, arrival_times, simulate
+from cfplan.simulation.engine.run import NEVER, PART, Schedule, Vehicles, arrival_times, simulate
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER = Timeouts().level_out_at_latest
 _PARTS = 9  # boxes of a sweep, if there are obstacles
+TUBE_PART = 40  # ms of motion per box of a tube, a multiple of the step
 _STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
 _LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
 _NEAR = 0.1  # m from a wall, within which an accelerometer that reads too much is simulated too
@@ -180,6 +181,23 @@ def link_loss_within_stops(
     return _judge(times, places, boxes, limits, np.empty((len(starts), 0, SNAPSHOT_SIZE)))
 
 
+def link_loss_tubes(payloads: NDArray, limits: Limits, rows: NDArray, rate: float = RATE) -> NDArray:
+    """Lose the link after the setpoints `rows`, (F,) int, of a flight, (N, 29) uint8 at `rate`, Hz.
+
+    Returns boxes, (2, F, S, 2, 3) m: low and high corners of the space that the vehicle is in during each TUBE_PART
+    from the setpoint on, first if its motors stop at once, then if it flies on with that setpoint. They enclose the
+    vehicles with all motor lags and errors of the estimate. In the last part the vehicle lies on the floor.
+    """
+    state, airframes, error = decode(payloads), _airframes(limits), limits.link_loss.vertical_acceleration_error
+    setpoints = setpoint_rows(state)
+    snapshots = _flown(setpoints, limits, airframes, rate, _begins(state, limits, None))[:, rows]
+    forks = _Forks(setpoints, rows, snapshots, airframes, parts=_LONGEST // TUBE_PART, part=TUBE_PART)
+    alone = _united([_go_on(forks, limits, error), _go_on(forks, limits, -error)])
+    tubes = np.stack([_fall(forks, limits), alone])
+    flies = np.flatnonzero((tubes[..., 1, 2] > 0.0).any(axis=(0, 1)))
+    return tubes[:, :, : flies.max(initial=0) + 2]
+
+
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
     """Return those of the snapshots, (L, ...) for each motor lag, that have the airframe's lag in safety.yaml."""
     return np.asarray(snapshots[_lags(limits).index(limits.airframe.motor_time_constant)])
@@ -264,13 +282,15 @@ def _simulate_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: L
 
 
 class _Forks(NamedTuple):
-    """Where the link is lost, and the time step of the simulation from there."""
+    """Where the link is lost, the time step of the simulation from there, and the boxes that it returns."""
 
     setpoints: NDArray  # (N, 20)
     rows: NDArray  # (F,) int, the last setpoints
     snapshots: NDArray  # (L, F, 31) when they arrive
     airframes: NDArray  # (L, 26)
     step: int = _STEP  # ms; a first look has _FIRST_STEP
+    parts: int = 0  # boxes of each sweep; 0: one, or _PARTS if there are obstacles
+    part: int = PART  # ms of each box, if there are several
 
 
 def _swept(forks: _Forks, limits: Limits) -> NDArray:
@@ -305,7 +325,9 @@ def _fall(forks: _Forks, limits: Limits) -> NDArray:
 def _without_setpoints(forks: _Forks, limits: Limits) -> Schedule:
     arrivals, gains = np.zeros(len(forks.setpoints), dtype=np.int64), gains_for(limits.airframe).pack()
     step = forks.step
-    return Schedule(forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step)
+    return Schedule(
+        forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step, part=forks.part
+    )  # fmt: skip
 
 
 def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
@@ -316,8 +338,25 @@ def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) 
         forks.snapshots.reshape(-1, SNAPSHOT_SIZE), np.repeat(forks.airframes, count, axis=0), last, last,
         np.full(len(last), NEVER), np.tile([0.0, 0.0, error], (len(last), 1)),
     )  # fmt: skip
-    parts = _PARTS if limits.space.obstacles else 1
-    return _united(list(simulate(batch, schedule, parts=parts).boxes.reshape(lags, count, parts, 2, 3)))
+    parts = forks.parts or (_PARTS if limits.space.obstacles else 1)
+    boxes = simulate(batch, schedule, parts=parts).boxes
+    if forks.parts:
+        _keep_drift(boxes, schedule)
+    return _united(list(boxes.reshape(lags, count, parts, 2, 3)))
+
+
+def _keep_drift(boxes: NDArray, schedule: Schedule) -> None:
+    """Widen the boxes of a tube, (F, S, 2, 3) m, in which a vehicle lies by the drift until it came down.
+
+    Those behind the end of the simulation repeat the box in which it came down; their height becomes that of the floor.
+    """
+    lies = boxes[:, :, 1, 2] <= 0.0
+    steps = lies.argmax(axis=1) * schedule.part // schedule.step
+    aside = np.where(lies, schedule.spread[np.minimum(steps, len(schedule.spread) - 1)][:, None], 0.0)[..., None]
+    boxes[:, :, 0, :2] -= aside
+    boxes[:, :, 1, :2] += aside
+    ended = (boxes[:, 1:] == boxes[:, :-1]).all(axis=(2, 3)) & (boxes[:, 1:, 0, 2] <= 0.0)
+    boxes[:, 1:, 1, 2][ended] = 0.0
 
 
 def _drift(limits: Limits, off: int, step: int) -> NDArray:

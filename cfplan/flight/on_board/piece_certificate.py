@@ -2,8 +2,8 @@
 
 The commander asks for position, velocity and acceleration, and for the yaw at which the controller turns its x axis; so
 the attitude is that with z along the thrust and y along z × [cos yaw, sin yaw, 0]. Thrust, attitude, body rates and
-motor thrusts follow from the pieces' derivatives up to snap, drag included. Samples and the allowance for what lies
-between them are those of the certificate of trajectories.
+motor thrusts follow from the pieces' derivatives up to snap, drag and the moment by velocity included. Samples and the
+allowance for what lies between them are those of the certificate of trajectories.
 """
 
 import math
@@ -171,7 +171,9 @@ def measures_along(samples: Samples, airframe: Airframe) -> NDArray:
 
     thrust = (size + (axial_drag - drag) * _dot(z, velocity))[:, 0]
     inertia = np.array(airframe.inertia)
-    torque = inertia * turning + np.cross(rate, inertia * rate)
+    about_x, about_y = airframe.velocity_moment
+    air = np.concatenate([about_x * _dot(y, velocity), -about_y * _dot(x, velocity), zero[:, None]], axis=1)
+    torque = inertia * turning + np.cross(rate, inertia * rate) - air
     motors = motor_thrusts(airframe, airframe.mass * thrust, (torque[:, 0], torque[:, 1], torque[:, 2]))
     return measures_of(
         velocity, acceleration, rate, z, thrust, angular_acceleration=turning, motor_thrust=np.stack(motors, axis=1)

@@ -21,6 +21,7 @@ from cfplan.flight.mocap.pose_tracker import PoseTracker
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, fault_abort, ordered
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.health import FRESH, GONE, UPLINK_GONE, Descent, Health, HealthMonitor
@@ -34,7 +35,7 @@ from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple, VehicleStatus
+from cfplan.flight.telemetry import Estimate, Level, Phase, PlanCommitted, PoseReceived, Triple, VehicleStatus
 from cfplan.safety.space import Space
 from cfplan.vehicle.rotations import yaw_of
 
@@ -80,8 +81,11 @@ class FlightLoop:
         history: FlightHistory,
         proposals: ProposalSource = NO_PROPOSALS,
         clock: Clock = REAL_CLOCK,
+        *,
+        conductor: ConductorSource = NO_CONDUCTOR,
     ):
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
+        self._conductor = conductor
         self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
         self._monitor, self.tracker = AbortMonitor(mission.limits), PoseTracker(mission.limits.pose)
         self._health_monitor, self.health = HealthMonitor(mission.limits.pose), Health()
@@ -423,8 +427,13 @@ class FlightLoop:
         return status is not None and status.time > self._stop_expected and not any(status.motor)
 
     def _check_orders(self) -> None:
-        """Raise AbortRaised for an operator command or the loss of the main process; also without a link."""
+        """Raise AbortRaised for an operator command, the fleet's braking, or the loss of the main process.
+
+        Also without a link.
+        """
         abort = ordered(self._orders.worst, main_gone=self._orders.gone)
+        if abort is None and (reason := self._conductor.brakes(self.now())):
+            abort = AbortReason.FLEET_BRAKES.abort(Rung.BRAKE, reason=reason)
         if abort is not None:
             self._leave_for(abort)
 
@@ -451,6 +460,13 @@ class FlightLoop:
             if done():
                 return True
         return done()
+
+    def await_clearance(self, phase: Phase) -> None:
+        """Tick until the fleet's conductor lets a phase begin; return at once where there is none."""
+        conductor = self._conductor
+        conductor.ask(phase)
+        if conductor.clearance(phase) > self.now():
+            self.until(lambda: conductor.clearance(phase) <= self.now(), math.inf)
 
     def pause(self, duration: float) -> None:
         """Tick for `duration`, s."""

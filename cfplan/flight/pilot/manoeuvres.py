@@ -7,6 +7,7 @@ from typing import Protocol
 from cfplan.errors import PreflightError
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
+from cfplan.flight.pilot.hover_check import check_hover
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
@@ -69,6 +70,7 @@ def begin_take_off(
 
     `way_between` two places makes setpoints. Raises PreflightError where the vehicle may not fly.
     """
+    loop.await_clearance(Phase.TAKE_OFF)
     loop.history.enter(Phase.TAKE_OFF)
     height, (x, y, _) = loop.mission.take_off_height, loop.pose().position
     yaw = yaw_of(loop.pose().quaternion)
@@ -84,7 +86,8 @@ def begin_take_off(
 def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Callable[[], object]) -> None:
     """Wait until the vehicle has climbed along `way` from the `floor` to a `height`, m; `stop` stops its motors.
 
-    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises.
+    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises or where its hover shows
+    another thrust than was certified.
     """
 
     def stays() -> bool:
@@ -95,6 +98,7 @@ def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Call
     loop.until(lambda: abs(loop.pose().position[2] - height) < _AT_PLACE_WITHIN, 2.0)
     if loop.pose().position[2] - floor < (height - floor) / 2:
         raise AbortRaised(AbortReason.DOES_NOT_RISE.abort(Rung.LAND))
+    check_hover(loop)
 
 
 def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:

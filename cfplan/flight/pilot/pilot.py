@@ -11,6 +11,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import fault_abort
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import ATTEMPTS, LINK_LOST_AFTER, AbortRaised, FlightLoop, LinkLost, OrderSource
 from cfplan.flight.pilot.health import FRESH
@@ -41,12 +42,13 @@ class Pilot:
         orders: OrderSource,
         enter_real_time: Callable[[], None] = lambda: None,
         proposals: ProposalSource = NO_PROPOSALS,
+        conductor: ConductorSource = NO_CONDUCTOR,
         clock: Clock = REAL_CLOCK,
     ):
-        self._mission = mission
+        self._mission, self._conductor = mission, conductor
         self._connect, self._enter_real_time = connect, enter_real_time
         self._history = FlightHistory(report, clock)
-        self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock)
+        self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock, conductor=conductor)
         self._manoeuvres: Manoeuvres = StreamedManoeuvres(self._loop, floor=0.0)  # until that is known
 
     def fly(self) -> FlightOutcome:
@@ -95,6 +97,7 @@ class Pilot:
         exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
+            self._conductor.leave(abort)
             loop.tolerate(self._history.rung)
             level = Level.ERROR if abort.rung is Rung.CUT else Level.WARNING
             self._history.add_event(level, f"{abort.rung.name.lower()}: {abort.text}")

@@ -52,6 +52,7 @@ def prepare(
     stood = _converge(loop)
     _preflight(loop, read, stood)
     loop.watch_motor_test()
+    loop.await_clearance(Phase.ARM)
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]

@@ -63,6 +63,7 @@ class StreamedManoeuvres:
     def fly_plan(self) -> None:
         """Stream the plan, then hover for the mission's hold time; a new plan that comes meanwhile is flown too."""
         loop = self._loop
+        loop.await_clearance(Phase.STREAM)
         skipped = loop.skipped
         loop.begin_plan()
         while True:

@@ -164,8 +164,8 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
     ),
     ParameterRule(
         "ctrlMel.massThrust", _exactly(lambda limits: limits.airframe.command_per_thrust),
-        "65535 over the airframe's largest thrust", Action.SET,
-        "It turns N into motor commands, and depends on the motors.", "restart the vehicle",
+        "65535 over the thrust of all motors at full command", Action.SET,
+        "It turns N into motor commands, and depends on the motors and their `thrust_scale`.", "restart the vehicle",
     ),
     ParameterRule(
         "locSrv.extPosStdDev", _exactly(lambda _: EXTERNAL_POSITION_STD), "2 mm", Action.SET,

@@ -31,6 +31,7 @@ from cfplan.recording.rerun.record_view import (
     log_tail,
 )
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, require_screen, viewer_program
+from cfplan.recording.summary import reference_times
 from cfplan.recording.topics import TOPICS, columns_of
 
 PERIOD = 0.1  # s between batches
@@ -137,7 +138,8 @@ class LiveView:
         log_limits(self._stream, shown, [end - self._start for end in ends])
         poses = part.poses
         log_tail(self._stream, layout.FLOWN, poses.time - self._start, poses.position, FLOWN, TRACK_RADIUS)
-        for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, part.setpoints.due, WANTED)):
+        wanted = reference_times(part.setpoints)
+        for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, wanted, WANTED)):
             if len(times) and entity not in self._drawn:
                 self._drawn.add(entity)
                 log_outline(self._stream, entity, self._header.vehicle.arm, times[:1] - self._start, colour)

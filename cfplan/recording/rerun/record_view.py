@@ -28,7 +28,7 @@ from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.plan_view import log_plan
 from cfplan.recording.rerun.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
 from cfplan.recording.rerun.viewer import open_viewer, save
-from cfplan.recording.summary import dropouts, pose_gaps, reference_span, summary_text
+from cfplan.recording.summary import dropouts, pose_gaps, reference_span, reference_times, summary_text
 from cfplan.safety.space import Box, Cylinder
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z
@@ -94,7 +94,7 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
     _log_whole_track(stream, record)
     for entity, times, colour in (
         (layout.BODY, record.poses.time, FLOWN_COLOUR),
-        (layout.GHOST, record.setpoints.due, WANTED_COLOUR),
+        (layout.GHOST, reference_times(record.setpoints), WANTED_COLOUR),
     ):
         if len(times):
             log_outline(stream, entity, record.header.vehicle.arm, times - record.start, colour)
@@ -170,7 +170,7 @@ def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot
     setpoints = replace(record.setpoints, quaternion=meant_motion(record.setpoints)[0])  # not that of the packets
     for entity, tail, times, moving, colour, radius in (
         (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
-        (layout.GHOST, layout.WANTED_TAIL, setpoints.due, setpoints, WANTED_COLOUR, WANTED_RADIUS),
+        (layout.GHOST, layout.WANTED_TAIL, reference_times(setpoints), setpoints, WANTED_COLOUR, WANTED_RADIUS),
     ):
         if len(times):
             columns = rr.Transform3D.columns(translation=moving.position, quaternion=moving.quaternion)

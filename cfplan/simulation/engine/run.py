@@ -51,7 +51,7 @@ from cfplan.simulation.engine.mellinger import (
 )
 
 NEVER = 2**40  # ms
-PART = 150  # ms of motion per box, if there are several
+PART = 150  # ms of motion per box, unless a schedule says otherwise
 _WORTH_THREADS = 2_000_000  # lanes times ms, above which a second thread saves time
 # Rows behind those of the vehicle: box swept, setpoint that is due, squared deviation, cosine of tilt, and the
 # acceleration by which the estimate is wrong without poses, m/s².
@@ -86,6 +86,7 @@ class Schedule(NamedTuple):
     spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
     latency: int = 0  # ms by which the estimate is late; used with traces
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
+    part: int = PART  # ms of motion per box, if there are several
 
 
 class Outcome(NamedTuple):
@@ -244,7 +245,7 @@ def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int
     """Update the results after step k; return the number of the current box."""
     aside = schedule.spread[min(k, len(schedule.spread) - 1)]
     _widen(lanes.values, used, aside)
-    after = min((k + 1) * schedule.step // PART, found.boxes.shape[1] - 1)
+    after = min((k + 1) * schedule.step // schedule.part, found.boxes.shape[1] - 1)
     if after != part:
         for n in range(lanes.size):
             _write_box(found.boxes[lanes.first + n, part], lanes.values, n)
