@@ -258,7 +258,7 @@ class World:
     def end_motor_test(self) -> None:
         self.motor_test = False
 
-    def revive_log(self, name: str) -> None:
+    def recreate_log(self, name: str) -> None:
         if name not in self.revived:
             self.revived.append(name)
 

@@ -85,7 +85,7 @@ def test_the_independent_body_is_found():
 def test_what_a_hover_cannot_tell_is_said_and_kept():
     found = identified(fly(0.0))
     for name in ("motor lag", "drag", "axial drag"):
-        assert "too vague" in found.quantities[name].untold
+        assert "too uncertain" in found.quantities[name].unobservable_reason
     assert found.airframe.motor_time_constant == NOMINAL.motor_time_constant
     assert found.airframe.drag == NOMINAL.drag
     assert found.airframe.thrust_scale * NOMINAL.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.01)

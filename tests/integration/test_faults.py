@@ -137,7 +137,7 @@ def test_body_axes_that_are_not_the_vehicles_end_the_flight_near_where_it_took_o
     fault = ViconFault(FaultKind.FLIP, 0.0, FOR_GOOD, math.radians(turned))
     scenario = Scenario("turned", Rung.LAND, (fault,), Phase.CONFIGURE, 0.0)
     truth = (flown := fly_stepped(scenario, line)).truth
-    assert "are its axes the vehicle's?" in flown.reason
+    assert "do their axes agree?" in flown.reason
     judged = judge(scenario, flown, line, readable=True)
     assert judged.rung == "land"
     assert judged.landed
@@ -373,7 +373,7 @@ def test_a_body_that_is_elsewhere_after_a_gap_while_it_stands_does_not_take_off(
     begins_anew = ViconFault(FaultKind.CLOSE, 0.0, 0.67), ViconFault(FaultKind.JUMP, 0.7, FOR_GOOD, 0.42)
     flown = fly_scenario(Scenario("elsewhere", Rung.NONE, begins_anew, phase, moment), line)
     assert flown.rung == "no take-off"
-    went = re.search(r"way that the standing body went: (\d+) mm", flown.reason)
+    went = re.search(r"drift of the standing body: (\d+) mm", flown.reason)
     assert went is not None
     assert int(went[1]) == pytest.approx(420, abs=10)
 

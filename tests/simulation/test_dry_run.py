@@ -128,7 +128,7 @@ def test_a_filter_that_knows_no_drag_strays_several_centimetres_more(good, encod
     run = dry_run(encoded, trajectory, older)
     assert not run.knows_drag
     assert run.deviation_median > good.deviation_median + 0.03
-    assert "not told of rotor drag" in dict(run.rows())["vehicle's filter"]
+    assert "without a model of rotor drag" in dict(run.rows())["vehicle's filter"]
 
 
 @pytest.mark.parametrize(

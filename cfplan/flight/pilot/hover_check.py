@@ -69,15 +69,17 @@ def check_hover(loop: FlightLoop) -> None:
         return False
 
     loop.until(collect, HOVER)
-    airframe, say = loop.limits.airframe, loop.history.say
+    airframe, add_event = loop.limits.airframe, loop.history.add_event
     if len(statuses) < _FEWEST or len(estimates) < _FEWEST:
-        say(Level.WARNING, "hover: the thrust scale is not known, as the vehicle's log was silent")
+        add_event(Level.WARNING, "hover: the thrust scale is not known, as the vehicle's log was silent")
         return
     seen = measure_hover(statuses, (estimates[0], estimates[-1]), airframe)
     if not (math.isfinite(seen.thrust_scale) and math.isfinite(seen.battery_voltage)):
-        say(Level.WARNING, "hover: the thrust scale is not known, as the log holds no motor commands or no voltage")
+        add_event(
+            Level.WARNING, "hover: the thrust scale is not known, as the log holds no motor commands or no voltage"
+        )
         return
-    say(Level.INFO, f"hover: thrust scale {seen.thrust_scale:.3f}, battery {seen.battery_voltage:.2f} V")
+    add_event(Level.INFO, f"hover: thrust scale {seen.thrust_scale:.3f}, battery {seen.battery_voltage:.2f} V")
     _require_certified(seen, airframe, loop.limits.plan)
 
 

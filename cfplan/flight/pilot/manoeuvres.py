@@ -20,7 +20,7 @@ _AT_PLACE_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 READY_TIMEOUT = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
 # m above the floor: when the setpoint has reached the first, the pose must have reached the second
-_ASKED_TO_RISE, _RISEN = 0.12, 0.015
+_SETPOINT_RISE, _POSE_RISE = 0.12, 0.015
 
 
 class Manoeuvres(Protocol):
@@ -53,7 +53,7 @@ def _require_ready(loop: FlightLoop) -> None:
     if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, READY_TIMEOUT):
         return
     if loop.status is None:
-        raise PreflightError("the vehicle does not tell its status", where="vehicle", hint="restart it and try again")
+        raise PreflightError("the vehicle does not report its status", where="vehicle", hint="restart it and try again")
     faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))
     armed = "is armed and not ready to fly" if loop.bits(ARMED) else "is no longer armed"
     raise PreflightError(
@@ -109,7 +109,7 @@ def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
     """
     pose = loop.pose()
     asked = way.position(pose.time - loop.mission.lead)[2]
-    return asked - floor > _ASKED_TO_RISE and pose.position[2] - floor < _RISEN
+    return asked - floor > _SETPOINT_RISE and pose.position[2] - floor < _POSE_RISE
 
 
 def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
@@ -126,7 +126,7 @@ def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
     raise PreflightError(
         "the tracked body stays on the floor while the vehicle takes off",
         where="motion capture",
-        hint="is it another body than the vehicle, are two of them swapped? Else look at battery and propellers",
+        hint="is it a different body, or are two bodies swapped? Otherwise check battery and propellers",
     )
 
 

@@ -38,7 +38,7 @@ PERIOD = 0.1  # s between batches
 CAPACITY = 50_000  # messages that wait at most; more are left out of the view, never of the record
 # Of these the last of a batch begins the next, so that lines have no gaps.
 _CARRIED = (SetpointSent, PoseReceived, VehicleStatus)
-_GOODBYE = 3.0  # s
+_CLOSE_TIMEOUT = 3.0  # s
 
 
 def open_live(header: RecordHeader, folder: Path) -> "LiveView":
@@ -89,7 +89,7 @@ class LiveView:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._sending is not None:
-            self._sending.stop(_GOODBYE)
+            self._sending.stop(_CLOSE_TIMEOUT)
 
     def show(self, message: Telemetry) -> None:
         """Take a message."""
@@ -108,7 +108,7 @@ class LiveView:
     def _end(self) -> None:
         if not self.failure and self._show_waiting() is not None:
             with contextlib.suppress(Exception):
-                self._stream.flush(timeout_sec=_GOODBYE / 2)
+                self._stream.flush(timeout_sec=_CLOSE_TIMEOUT / 2)
         with contextlib.suppress(Exception):
             self._stream.disconnect()
 
