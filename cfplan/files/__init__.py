@@ -3,4 +3,4 @@
 And where files are: the nearest of a name above a folder, what comes with cfplan, and new ones, whole or not at all.
 """
 
-__all__ = ["json_values", "nearest", "shipped", "text", "whole", "yaml_with_places"]
+__all__ = ["atomic", "json_values", "nearest", "shipped", "text", "yaml_with_places"]

@@ -36,12 +36,13 @@ from cfplan.simulation.engine.layout import (
     pack_airframe,
     setpoint_rows,
 )
-from cfplan.simulation.engine.run import NEVER, Schedule, Vehicles, arrival_times, simulate
+from cfplan.simulation.engine.run import NEVER, PART, Schedule, Vehicles, arrival_times, simulate
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
 LEVEL_AFTER = Timeouts().level_out_at_latest
 _PARTS = 9  # boxes of a sweep, if there are obstacles
+TUBE_PART = 40  # ms of motion per box of a tube, a multiple of the step
 _STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
 _LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
 _NEAR = 0.1  # m from a wall, within which an accelerometer that reads too much is simulated too
@@ -127,7 +128,7 @@ def link_loss_near_walls(
     as ending ALLOWANCE farther out. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half
     the time.
     """
-    return _look_at_some(payloads, limits, rate, starts, within)
+    return _simulate_sample(payloads, limits, rate, starts, within)
 
 
 def link_loss_at_walls(
@@ -137,7 +138,7 @@ def link_loss_at_walls(
 
     Like link_loss_near_walls(), but if every setpoint ends inside, the worst moment is not found.
     """
-    return _look_at_some(payloads, limits, rate, starts, None)
+    return _simulate_sample(payloads, limits, rate, starts, None)
 
 
 def foreseen_link_loss(
@@ -157,7 +158,7 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
         return found
     rows, boxes = setpoint_rows(state), found.boxes
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, None))
-    _look_again(boxes, rows, snapshots, limits, ~(found.beyond < -_SLOW_ALLOWANCE))
+    _simulate_again(boxes, rows, snapshots, limits, ~(found.beyond < -_SLOW_ALLOWANCE))
     return _judge(found.time, state.position, boxes, limits, snapshots)
 
 
@@ -178,6 +179,23 @@ def link_loss_within_stops(
     boxes = _swept(lost, limits)
     times, places = np.nonzero(forks)[1] / rate, rows[..., 0:3][forks]
     return _judge(times, places, boxes, limits, np.empty((len(starts), 0, SNAPSHOT_SIZE)))
+
+
+def link_loss_tubes(payloads: NDArray, limits: Limits, rows: NDArray, rate: float = RATE) -> NDArray:
+    """Lose the link after the setpoints `rows`, (F,) int, of a flight, (N, 29) uint8 at `rate`, Hz.
+
+    Returns boxes, (2, F, S, 2, 3) m: low and high corners of the space that the vehicle is in during each TUBE_PART
+    from the setpoint on, first if its motors stop at once, then if it flies on with that setpoint. They enclose the
+    vehicles with all motor lags and errors of the estimate. In the last part the vehicle lies on the floor.
+    """
+    state, airframes, error = decode(payloads), _airframes(limits), limits.link_loss.vertical_acceleration_error
+    setpoints = setpoint_rows(state)
+    snapshots = _flown(setpoints, limits, airframes, rate, _begins(state, limits, None))[:, rows]
+    forks = _Forks(setpoints, rows, snapshots, airframes, parts=_LONGEST // TUBE_PART, part=TUBE_PART)
+    alone = _united([_go_on(forks, limits, error), _go_on(forks, limits, -error)])
+    tubes = np.stack([_fall(forks, limits), alone])
+    flies = np.flatnonzero((tubes[..., 1, 2] > 0.0).any(axis=(0, 1)))
+    return tubes[:, :, : flies.max(initial=0) + 2]
 
 
 def as_believed(snapshots: NDArray, limits: Limits) -> NDArray:
@@ -220,11 +238,11 @@ def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | 
     state, middle = decode(payloads), _middle(limits)
     rows, airframe = setpoint_rows(state), _airframes(limits)[middle : middle + 1]
     snapshots = _flown(rows, limits, airframe, rate, _begins(state, limits, starts)[middle : middle + 1])
-    boxes = _first_look(rows, snapshots[0], limits, every)
+    boxes = _simulate_coarsely(rows, snapshots[0], limits, every)
     return _judge(np.arange(len(rows)) / rate, state.position, boxes, limits, snapshots)
 
 
-def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
+def _simulate_coarsely(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
     """Return boxes, (N, S, 2, 3), by one motor lag, coarse steps and one in `every` setpoints.
 
     `snapshots`, (N, 31), are those of that lag. A setpoint between two simulated ones gets the boxes of both.
@@ -237,40 +255,42 @@ def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -
     return _united([boxes[np.where(some, after, after - 1)], boxes[after]])
 
 
-def _look_at_some(
+def _simulate_sample(
     payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, within: float | None
 ) -> LinkLossMoments:
     """Simulate closely the setpoints that may end `within` m of a wall, and the worst; None: that may end outside."""
     state = decode(payloads)
     rows, number = setpoint_rows(state), np.arange(len(payloads))
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
-    boxes = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
+    boxes = _simulate_coarsely(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
     most = limits.space.swept(boxes)[0] + ALLOWANCE
     near = ~(most < -(within or 0.0))
     if within is not None:
         near |= number == most.argmax()
-    _look_again(boxes, rows, snapshots, limits, near)
+    _simulate_again(boxes, rows, snapshots, limits, near)
     found = _judge(number / rate, state.position, boxes, limits, snapshots)
     others = ~near & (most > found.beyond[near].max(initial=-np.inf))
     if within is not None and others.any():  # these may be worse
-        _look_again(boxes, rows, snapshots, limits, others)
+        _simulate_again(boxes, rows, snapshots, limits, others)
         found, near = _judge(number / rate, state.position, boxes, limits, snapshots), near | others
     return replace(found, beyond=np.where(near, found.beyond, most))
 
 
-def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
+def _simulate_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
     """Replace `some`, (N,) bool, of the boxes, (N, S, 2, 3), of a first look; `snapshots` are (L, N, 31)."""
     boxes[some] = _swept(_Forks(rows, np.flatnonzero(some), snapshots[:, some], _airframes(limits)), limits)
 
 
 class _Forks(NamedTuple):
-    """Where the link is lost, and the time step of the simulation from there."""
+    """Where the link is lost, the time step of the simulation from there, and the boxes that it returns."""
 
     setpoints: NDArray  # (N, 20)
     rows: NDArray  # (F,) int, the last setpoints
     snapshots: NDArray  # (L, F, 31) when they arrive
     airframes: NDArray  # (L, 26)
     step: int = _STEP  # ms; a first look has _FIRST_STEP
+    parts: int = 0  # boxes of each sweep; 0: one, or _PARTS if there are obstacles
+    part: int = PART  # ms of each box, if there are several
 
 
 def _swept(forks: _Forks, limits: Limits) -> NDArray:
@@ -289,7 +309,7 @@ def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
     """Fly on with the last setpoints; the accelerometer reads `error`, m/s², too little."""
     off, step = Timeouts().motors_off_at_latest(limits.firmware.watchdog), forks.step
     level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
-    return _leave(forks, limits, error, _alone(forks, limits)._replace(
+    return _lose_link(forks, limits, error, _without_setpoints(forks, limits)._replace(
         level_after=level, off_after=off, spread=_drift(limits, off, step)
     ))  # fmt: skip
 
@@ -299,16 +319,18 @@ def _fall(forks: _Forks, limits: Limits) -> NDArray:
     airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
     snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
     forks = forks._replace(snapshots=snapshots, airframes=airframes)
-    return _leave(forks, limits, 0.0, _alone(forks, limits)._replace(off_after=0))
+    return _lose_link(forks, limits, 0.0, _without_setpoints(forks, limits)._replace(off_after=0))
 
 
-def _alone(forks: _Forks, limits: Limits) -> Schedule:
+def _without_setpoints(forks: _Forks, limits: Limits) -> Schedule:
     arrivals, gains = np.zeros(len(forks.setpoints), dtype=np.int64), gains_for(limits.airframe).pack()
     step = forks.step
-    return Schedule(forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step)
+    return Schedule(
+        forks.setpoints, arrivals, gains, steps=_LONGEST // step, step=step, control=step, part=forks.part
+    )  # fmt: skip
 
 
-def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
+def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
     """Return the boxes, (F, S, 2, 3) m, of all airframes together."""
     lags, count = len(forks.airframes), len(forks.rows)
     last = np.tile(forks.rows, lags)
@@ -316,8 +338,25 @@ def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> N
         forks.snapshots.reshape(-1, SNAPSHOT_SIZE), np.repeat(forks.airframes, count, axis=0), last, last,
         np.full(len(last), NEVER), np.tile([0.0, 0.0, error], (len(last), 1)),
     )  # fmt: skip
-    parts = _PARTS if limits.space.obstacles else 1
-    return _united(list(simulate(batch, schedule, parts=parts).boxes.reshape(lags, count, parts, 2, 3)))
+    parts = forks.parts or (_PARTS if limits.space.obstacles else 1)
+    boxes = simulate(batch, schedule, parts=parts).boxes
+    if forks.parts:
+        _keep_drift(boxes, schedule)
+    return _united(list(boxes.reshape(lags, count, parts, 2, 3)))
+
+
+def _keep_drift(boxes: NDArray, schedule: Schedule) -> None:
+    """Widen the boxes of a tube, (F, S, 2, 3) m, in which a vehicle lies by the drift until it came down.
+
+    Those behind the end of the simulation repeat the box in which it came down; their height becomes that of the floor.
+    """
+    lies = boxes[:, :, 1, 2] <= 0.0
+    steps = lies.argmax(axis=1) * schedule.part // schedule.step
+    aside = np.where(lies, schedule.spread[np.minimum(steps, len(schedule.spread) - 1)][:, None], 0.0)[..., None]
+    boxes[:, :, 0, :2] -= aside
+    boxes[:, :, 1, :2] += aside
+    ended = (boxes[:, 1:] == boxes[:, :-1]).all(axis=(2, 3)) & (boxes[:, 1:, 0, 2] <= 0.0)
+    boxes[:, 1:, 1, 2][ended] = 0.0
 
 
 def _drift(limits: Limits, off: int, step: int) -> NDArray:

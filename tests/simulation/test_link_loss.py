@@ -18,11 +18,13 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.link_loss import (
     ALLOWANCE,
+    TUBE_PART,
     foreseen_link_loss,
     link_loss_at_every_setpoint,
     link_loss_at_walls,
     link_loss_near_walls,
     link_loss_of_slow_motion,
+    link_loss_tubes,
     link_loss_within_stops,
     simulate_link_loss,
 )
@@ -291,6 +293,26 @@ def test_setpoints_as_they_are_sent_are_harmless_when_they_stop(line, limits):
     assert lost.distance < 1.2
 
 
+def test_a_tube_holds_the_vehicle_at_each_time_and_sweeps_what_the_whole_fall_sweeps(line, limits):
+    rows = np.arange(0, len(line.payloads), 40)
+    tubes, whole = link_loss_tubes(line.payloads, limits, rows), link_loss_at_every_setpoint(line.payloads, limits)
+    low, high = tubes[..., 0, :].min(axis=(0, 2)), tubes[..., 1, :].max(axis=(0, 2))
+    assert np.all(low <= whole.low[rows])
+    assert np.all(high >= whole.high[rows])
+    assert np.abs(low - whole.low[rows]).max() < 0.03  # the accelerometer that reads too much
+    assert np.abs(high - whole.high[rows]).max() < 0.03
+    assert not np.any(tubes[:, :, -1, 1, 2])  # it lies
+    lag = limits.airframe.motor_time_constant
+    for at in range(0, len(rows), 3):
+        for tube, times in zip(tubes[:, at], ({"off_after": 0}, {"off_after": 1040}), strict=True):
+            places = fly_on(line.payloads, limits.airframe, int(rows[at]), lag=lag, **times)
+            part = np.minimum((np.arange(len(places)) + 1) // TUBE_PART, len(tube) - 1)
+            assert np.all(places >= tube[part, 0] - 0.01)
+            assert np.all(places <= tube[part, 1] + 0.01)
+            assert np.all(places[-1, :2] >= tube[-1, 0, :2] - 0.01)
+            assert np.all(places[-1, :2] <= tube[-1, 1, :2] + 0.01)
+
+
 def test_the_virtual_crazyflie_goes_there_too(line, limits):
     moments = np.round(np.array([0.3, 0.5, 0.7]) * line.motion_ends, 2)
     right = link_loss_at_every_setpoint(line.payloads, without_errors(limits))
@@ -306,9 +328,9 @@ def test_the_virtual_crazyflie_goes_there_too(line, limits):
         assert alone[-1] == pytest.approx(on[-1], abs=0.2)
 
 
-@pytest.mark.parametrize("told_of_drag", ["yes", "no"])
-def test_a_vehicle_that_flies_on_its_estimate_comes_down_near_the_swept_box(told_of_drag):
+@pytest.mark.parametrize(("path", "knows_drag"), [("line", "yes"), ("circle", "no")])
+def test_a_vehicle_that_flies_on_its_estimate_comes_down_near_the_swept_box(path, knows_drag):
     """Without the allowances of firmware that knows no drag it comes down 0.3 m off."""
-    lost = lose_link_and_poses((REPOSITORY / "flights" / "line.yaml", told_of_drag, 5, 6))
+    lost = lose_link_and_poses((REPOSITORY / "flights" / f"{path}.yaml", knows_drag, 5, 6))
     assert lost["most"] < 0.08
     assert lost["outside"] == 0

@@ -88,23 +88,28 @@ def stop_motion(
     With it comes the acceleration of each row BRAKE_LEAD later, (K · M, 3). Body rates and the length of the thrust
     vector have the leads, s, of the setpoints of a plan.
     """
+    yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
+    *fields, acceleration = _stop_rows(
+        arrays_of(motion),
+        np.array(yaw, dtype=float),
+        np.array(begin, dtype=np.int64),
+        stop_clock(rate, duration),
+        rate,
+        np.array([rate_lead * rate, thrust_lead * rate]),
+    )
+    stops = FullStateSetpoints(*(field.reshape(-1, field.shape[-1]) for field in fields))
+    return stops, ahead(acceleration, rate).reshape(-1, 3)
+
+
+def stop_clock(rate: float, duration: float = DURATION) -> NDArray:
+    """Return a stop's clock, (3, M) at `rate`, Hz: setpoints elapsed along the motion, its rate, its change, 1/s."""
     steps = round(duration * rate)
     fraction = np.arange(steps + 1) / steps
     clock_rate = 1.0 - fraction**3 * (10.0 - 15.0 * fraction + 6.0 * fraction**2)
     slowing = -30.0 * fraction**2 * (1.0 - fraction) ** 2 / duration
     elapsed = fraction - 2.5 * fraction**4 + 3.0 * fraction**5 - fraction**6  # the integral of clock_rate
     elapsed *= duration * rate  # in setpoints
-    yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
-    *fields, acceleration = _stop_rows(
-        arrays_of(motion),
-        np.array(yaw, dtype=float),
-        np.array(begin, dtype=np.int64),
-        np.stack([elapsed, clock_rate, slowing]),
-        rate,
-        np.array([rate_lead * rate, thrust_lead * rate]),
-    )
-    stops = FullStateSetpoints(*(field.reshape(-1, field.shape[-1]) for field in fields))
-    return stops, ahead(acceleration, rate).reshape(-1, 3)
+    return np.stack([elapsed, clock_rate, slowing])
 
 
 _Rows = tuple[NDArray, NDArray, NDArray, NDArray, NDArray, NDArray]

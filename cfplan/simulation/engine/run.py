@@ -45,13 +45,13 @@ from cfplan.simulation.engine.mellinger import (
     ON_BOARD,
     YAW_RATE,
     Gains,
-    ask,
     mellinger,
     mixed,
+    store_commands,
 )
 
 NEVER = 2**40  # ms
-PART = 150  # ms of motion per box, if there are several
+PART = 150  # ms of motion per box, unless a schedule says otherwise
 _WORTH_THREADS = 2_000_000  # lanes times ms, above which a second thread saves time
 # Rows behind those of the vehicle: box swept, setpoint that is due, squared deviation, cosine of tilt, and the
 # acceleration by which the estimate is wrong without poses, m/s².
@@ -86,6 +86,7 @@ class Schedule(NamedTuple):
     spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
     latency: int = 0  # ms by which the estimate is late; used with traces
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
+    part: int = PART  # ms of motion per box, if there are several
 
 
 class Outcome(NamedTuple):
@@ -160,9 +161,9 @@ def _fly(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome) -> 
             due_at = _receive(lanes, batch, schedule, found, now)
         if len(found.trace) > 0:
             _note_step(lanes, found, k)
-        _miss(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
+        _drop_poses(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
         if schedule.latency > 0 or len(schedule.noise) > 0:
-            _err(lanes, schedule, found, k)
+            _add_estimate_errors(lanes, schedule, found, k)
         _supervise(values, schedule, now)
         if now < schedule.off_after and now % schedule.control == 0:
             levels, period = now >= schedule.level_after, 0.001 * schedule.control
@@ -244,7 +245,7 @@ def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int
     """Update the results after step k; return the number of the current box."""
     aside = schedule.spread[min(k, len(schedule.spread) - 1)]
     _widen(lanes.values, used, aside)
-    after = min((k + 1) * schedule.step // PART, found.boxes.shape[1] - 1)
+    after = min((k + 1) * schedule.step // schedule.part, found.boxes.shape[1] - 1)
     if after != part:
         for n in range(lanes.size):
             _write_box(found.boxes[lanes.first + n, part], lanes.values, n)
@@ -278,7 +279,7 @@ def _read_snapshot(snapshot: NDArray, lanes: NDArray, n: int) -> None:
 
 
 @njit(allocates=False, error_model="numpy")
-def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
+def _drop_poses(lanes: NDArray, count: int, blind_for: float) -> None:
     """Set the errors of all estimates from an error of acceleration over `blind_for`, s without poses."""
     count = min(count, WIDTH)  # the compiler must see that no index overflows
     for n in range(count):
@@ -289,7 +290,7 @@ def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
 
 
 @register_jitable
-def _err(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
+def _add_estimate_errors(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
     """Add latency and noise to the errors of all estimates."""
     seen = max(k - schedule.latency // schedule.step, 0)
     for n in range(lanes.size):
@@ -322,7 +323,7 @@ def _control_lane(lanes: NDArray, n: int, gains: Gains, mode: Any, period: float
     place = x - missed[0], y - missed[1], z - missed[2]
     speed = vx - missed_speed[0], vy - missed_speed[1], vz - missed_speed[2]
     belief = place, speed, quadruple(lanes, WIDTH, n, 6), vector(lanes, WIDTH, n, 10)
-    ask(lanes, WIDTH, n, mixed(mellinger(lanes, WIDTH, n, gains, mode, belief, period)))
+    store_commands(lanes, WIDTH, n, mixed(mellinger(lanes, WIDTH, n, gains, mode, belief, period)))
 
 
 @njit(allocates=False, error_model="numpy")
