@@ -85,7 +85,7 @@ def _bodies(fleet: FleetFile) -> dict[str, str]:
 
 def _prepared(flight: PlannedFlight, steps: Steps) -> PreparedFlight:
     """Encode and rehearse the flight of a vehicle, and certify its stops. Raises NotCertifiedError."""
-    steps.say(f"  {flight.name}")
+    steps.print(f"  {flight.name}")
     encoded = encode_flight(flight, steps)
     rehearsed, lost = rehearse(flight, encoded, steps), find_link_loss(encoded, flight.limits, steps)
     mission, stops = make_mission(encoded, flight.limits, steps)
@@ -151,7 +151,7 @@ class _Shown:
     def _say(self, time: float, name: str, text: str) -> None:
         if math.isnan(self._began):
             self._began = time
-        self._steps.say(f"  {time - self._began:6.2f} s  {name}: {text}")
+        self._steps.print(f"  {time - self._began:6.2f} s  {name}: {text}")
 
 
 def _summarised(vehicles: list[_Vehicle], outcome: FleetOutcome) -> dict[str, FlightSummary]:
