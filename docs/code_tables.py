@@ -16,12 +16,12 @@ from cfplan.flight.mocap.child import FRAME_ALARM
 from cfplan.flight.mocap.datastream_client import FRAME_TIMEOUT
 from cfplan.flight.mocap.feed import RESTART_BACKOFF
 from cfplan.flight.mocap.pose_tracker import MAX_EXTRAPOLATION
-from cfplan.flight.mocap.source import OPEN_WITHIN
+from cfplan.flight.mocap.source import OPEN_TIMEOUT
 from cfplan.flight.pilot.abort_monitor import LATEST_SETPOINT
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, MOTOR_TEST_PERIOD
 from cfplan.flight.pilot.health import LOG_GONE, UPLINK_GONE
-from cfplan.flight.pilot.landing import MAX_BLIND_LANDING, MOTORS_STOP_WITHIN, POSES_TRUSTED_AFTER
+from cfplan.flight.pilot.landing import MAX_BLIND_LANDING, MOTORS_STOP_TIMEOUT, POSES_TRUSTED_AFTER
 from cfplan.flight.pilot.manoeuvres import READY_TIMEOUT
 from cfplan.flight.pilot.on_board_manoeuvres import ANSWER_TIMEOUT
 from cfplan.flight.pilot.pilot import CUT_TIMEOUT
@@ -29,9 +29,9 @@ from cfplan.flight.pilot.prearm import LISTEN_WHILE_ARMED
 from cfplan.flight.pilot.process import LANDING_TIMEOUT
 from cfplan.flight.pilot.proposals import LOOKS_UNTIL
 from cfplan.flight.pilot.vehicle_rules import COMMANDER_SIGNS, PARAMETER_RULES, UNKNOWABLE
-from cfplan.flight.radio.connection import FIRST_ANSWER
-from cfplan.flight.radio.perishable import KEEPS_FOR
-from cfplan.flight.radio.session import TABLES_WITHIN
+from cfplan.flight.radio.connection import FIRST_ANSWER_TIMEOUT
+from cfplan.flight.radio.perishable import MAX_AGE
+from cfplan.flight.radio.session import TABLES_TIMEOUT
 from cfplan.flight.setpoints.stops import DURATION as STOP_DURATION
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.supervisor import Settings
@@ -100,7 +100,7 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
                 "supervisor.landedTimeout"),
     ),
     "link": (
-        TimeOut("the acknowledgement of a setpoint or pose that the radio repeats", KEEPS_FOR,
+        TimeOut("the acknowledgement of a setpoint or pose that the radio repeats", MAX_AGE,
                 "the packet is dropped: a newer one waits", "the pilot's radio link"),
         TimeOut("a log of the vehicle, estimate or status, while the vehicle acknowledges", LOG_GONE,
                 "the vehicle brakes along its path and lands by poses; the log is created again meanwhile",
@@ -161,15 +161,15 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
                 "`cfplan.connect()`"),
     ),
     "beginning": (
-        TimeOut("the first packet back", FIRST_ANSWER, "`nothing answers`", "the pilot"),
-        TimeOut("the vehicle's tables", TABLES_WITHIN, "`its tables do not come through`", "the pilot"),
-        TimeOut("the first good poses", OPEN_WITHIN, "the flight is refused", "the pose feed"),
+        TimeOut("the first packet back", FIRST_ANSWER_TIMEOUT, "`nothing answers`", "the pilot"),
+        TimeOut("the vehicle's tables", TABLES_TIMEOUT, "`its tables do not come through`", "the pilot"),
+        TimeOut("the first good poses", OPEN_TIMEOUT, "the flight is refused", "the pose feed"),
         TimeOut("other commanders, listened for once the vehicle is armed", LISTEN_WHILE_ARMED,
                 "if one is heard, the vehicle is disarmed", "the pilot"),
         TimeOut("the supervisor's report that it may fly", READY_TIMEOUT, "no take-off: it is disarmed", "the pilot"),
     ),
     "end": (
-        TimeOut("the report that motors have stopped, asked for several times", MOTORS_STOP_WITHIN,
+        TimeOut("the report that motors have stopped, asked for several times", MOTORS_STOP_TIMEOUT,
                 "the motors are cut", "the pilot"),
         TimeOut("the report that a cut has arrived, sent at each tick", CUT_TIMEOUT,
                 "an error is reported and the link is closed: by then the vehicle stops by itself", "the pilot"),
@@ -241,7 +241,7 @@ def parameters() -> str:
     titles = ["parameter", "must be", "what cfplan does", "why", "since firmware"]
     return grid(titles, [
         [
-            f"`{rule.name}`", rule.wanted, str(rule.action), rule.reason,
+            f"`{rule.name}`", rule.allowed_text, str(rule.action), rule.reason,
             (version_text(rule.since) or "any") + (f"; without it: {rule.missing}" if rule.missing else ""),
         ]
         for rule in PARAMETER_RULES

@@ -27,7 +27,7 @@ from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
 _NEAR = 0.02  # m, out of the box; planning aims at so much inside the walls
-_WITHOUT_DRAG = 2025, 12  # a firmware whose filter cannot be told of rotor drag
+_WITHOUT_DRAG = 2025, 12  # a firmware whose filter has no model of rotor drag
 _LONGEST = 4.0  # s from the last setpoint until every vehicle lies on the floor
 
 
@@ -42,7 +42,7 @@ class Settings:
 
 COLUMNS = (
     Column("path", "path"),
-    Column("knows_drag", "told of drag", meaning="whether the firmware's filter can be, as from 2026.04 on"),
+    Column("knows_drag", "models drag", meaning="whether the firmware's filter models rotor drag, as from 2026.04 on"),
     Column("flights", "flights", "", ".0f", meaning="drawn vehicles times moments"),
     Column("within", "within the box", "%", ".1f", meaning=f"of flights, within {100 * _NEAR:g} cm of it"),
     Column("p95", "out of the box, 95 %", "m", ".2f", meaning="95th percentile over all flights; negative inside"),
@@ -58,21 +58,23 @@ REFUSED_COLUMNS = (*COLUMNS[:2], Column("refused", "reason"))
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path and kind of firmware."""
     kinds = product(settings.path_files, ("yes", "no"))
-    cases = {f"{file}, {told}": (file, told, settings.moments, settings.draws) for file, told in kinds}
+    cases = {
+        f"{file}, {knows_drag}": (file, knows_drag, settings.moments, settings.draws) for file, knows_drag in kinds
+    }
     return Work(cases, measure)
 
 
 def measure(case: tuple[Path, str, int, int]) -> dict[str, Any]:
     """Lose link and poses at some moments of a path's flight, or return why it is not planned or sent."""
-    path_file, told, moments, draws = case
+    path_file, knows_drag, moments, draws = case
     limits = limits_for(path_file)
-    if told == "no":
+    if knows_drag == "no":
         limits = replace(limits, firmware=replace(limits.firmware, oldest=_WITHOUT_DRAG))
     try:
         planned = plan_flight(path_file, limits)
         encoded = encode_flight(planned)
     except CfplanError as error:
-        return {"path": path_file.stem, "knows_drag": told, "refused": str(error)}
+        return {"path": path_file.stem, "knows_drag": knows_drag, "refused": str(error)}
     boxes, flight = link_loss_at_every_setpoint(encoded.payloads, limits), rehearsed_flight(
         encoded, planned.plan.trajectory
     )  # fmt: skip
@@ -88,7 +90,7 @@ def measure(case: tuple[Path, str, int, int]) -> dict[str, Any]:
             beyond.append(float(limits.space.swept(swept)[0][0]))
     return {
         "path": path_file.stem,
-        "knows_drag": told,
+        "knows_drag": knows_drag,
         "flights": len(out),
         "within": float(np.mean(np.array(out) <= _NEAR)),
         "p95": float(np.quantile(out, 0.95)),

@@ -19,6 +19,7 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.path_file import load_path_file
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, rehearse
+from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.dry_run import dry_run
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import hopf_quaternion
@@ -30,6 +31,7 @@ from studies.runner.reductions import count, largest, mean, rms, total
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
+_DRAWN_BY = 7  # seed of the vehicles: others than those of dry runs
 PLAN_COLUMNS = (
     Column("path", "path"),
     Column("length", "length", "m", ".1f"),
@@ -90,6 +92,7 @@ class Settings:
     repeats: int = option(1, "Flights of each path.", least=1)
     loss: float = option(0.0, "Fraction of the radio's packets that is lost.", least=0)
     pose_noise: float = option(0.001, "Standard deviation of poses on each axis, m.", least=0)
+    drawn: bool = option(False, "Each flight on another vehicle, drawn by the spread of the airframe.")
     seed: int = option(0, "Seed of the noise of each path's first flight.", least=0)
 
 
@@ -146,18 +149,22 @@ def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = f
     lab = Conditions(settings.loss, settings.pose_noise, settings.seed)
     for file in settings.path_files:
         load_path_file(file)
-    cases = {}
+    cases: dict[str, tuple[int, int, Prepared]] = {}
     for number, file in enumerate(settings.path_files):
         run.progress(number, len(settings.path_files))
         prepared = _prepared(file, settings.seed)
-        for seed in range(lab.seed, lab.seed + (settings.repeats if prepared.mission else 1)):
-            cases[f"{file.stem} {seed}"] = seed, prepared
+        for k in range(settings.repeats if prepared.mission else 1):
+            cases[f"{file.stem} {lab.seed + k}"] = lab.seed + k, len(cases), prepared
 
-    def measure(case: tuple[int, Prepared]) -> JudgedFlight:
-        seed, (row, mission, trajectory) = case
+    def measure(case: tuple[int, int, Prepared]) -> JudgedFlight:
+        seed, number, (row, mission, trajectory) = case
         if mission is None or trajectory is None:
             return row
-        flight = fly(mission, replace(lab, seed=seed), name=row.path)
+        vehicle = None
+        if settings.drawn:
+            limits = mission.limits
+            vehicle = draw_vehicles(limits.airframe, limits.pose, len(cases), _DRAWN_BY)[number].airframe
+        flight = fly(mission, replace(lab, seed=seed, airframe=vehicle), name=row.path)
         if flight.outcome is not None and flight.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR:
             raise KeyboardInterrupt  # the operator's stop ends the study too
         return _judged(replace(row, seed=seed), trajectory, flight)
@@ -172,6 +179,7 @@ def tables(settings: Settings, rows: list[JudgedFlight]) -> Iterator[Table]:
     title = (
         f"Flights: deviation from the reference in time, {100 * settings.loss:g} % of radio packets lost, "
         f"{1e3 * settings.pose_noise:g} mm of pose noise, motor lag {lag:g} s"
+        f"{', each on a vehicle drawn by the spread of the airframe' if settings.drawn else ''}"
     )
     yield table("plans", "Plans", PLAN_COLUMNS, planned, by=("path",))
     yield table("flights-by-path", title, FLIGHT_COLUMNS, rows, by=("path",), last="all")
@@ -189,7 +197,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
         planned = plan_flight(file, limits_for(file))
         encoded = encode_flight(planned)
         plan = planned.plan
-        bare = _without_drag(encoded, plan.trajectory)
+        bare = without_drag(encoded, plan.trajectory)
         row = JudgedFlight(
             path=file.stem,
             seed=seed,
@@ -209,7 +217,7 @@ def _prepared(file: Path, seed: int) -> Prepared:
         return Prepared(JudgedFlight(file.stem, seed, str(error)))
 
 
-def _without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
+def without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFlight:
     """Return the same flight with accelerations and attitudes of the motion alone, without drag compensation."""
     times = encoded.times + LEAD
     states = trajectory.at(times)
@@ -245,5 +253,9 @@ def _judged(row: JudgedFlight, trajectory: Trajectory, flight: RealTimeFlight) -
 
 
 STUDY = Study(
-    Settings, work, tables, "flights/*.yaml --repeats 5 --loss 0.05 -o results/flights.json", one_at_a_time=True
+    Settings,
+    work,
+    tables,
+    "flights/*.yaml --repeats 5 --loss 0.05 --drawn -o results/flights.json",
+    one_at_a_time=True,
 )

@@ -1,7 +1,7 @@
 """Identify random vehicles from one flight along PATH each in the stepped lab, and fly NEXT with the results.
 
-Mass, motor lag, drag, thrust and pose latency are drawn by seed. Each vehicle flies PATH as if it were the one of
-safety.yaml; identification sees only its record, read back from the file. Then every vehicle flies NEXT four times:
+Mass, motor lag, drag, thrust, moment and pose latency are drawn by seed. Each vehicle flies PATH as if it were the one
+of safety.yaml; identification sees only its record, read back from the file. Then every vehicle flies NEXT four times:
 with the parameters of safety.yaml, as identified, as identified without having been weighed, and with its true ones.
 """
 
@@ -39,7 +39,7 @@ from studies.runner.reductions import count, largest, median
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-MASS, THRUST = 0.10, 0.08  # largest relative deviation from the nominal values
+MASS, THRUST, MOMENT = 0.10, 0.08, 0.30  # largest relative deviation from the nominal values
 LAGS, DRAGS, LATENCIES = (0.06, 0.14), (0.5, 2.0), (0.005, 0.040)  # s, factor, s
 SCALE_STEP = 1e-4  # kg, resolution of the scale that weighs the vehicle
 _FIRST_SEED = 1000
@@ -109,9 +109,17 @@ def draw_vehicle(seed: int, nominal: Airframe) -> DrawnVehicle:
         mass=nominal.mass * (1 + chance.uniform(-MASS, MASS)),
         motor_time_constant=float(chance.uniform(*LAGS)),
         drag=(nominal.drag[0] * drag, nominal.drag[1] * drag),
-        motor_thrust_max=nominal.motor_thrust_max * (1 + chance.uniform(-THRUST, THRUST)),
+        thrust_scale=nominal.thrust_scale * (1 + chance.uniform(-THRUST, THRUST)),
     )
-    return DrawnVehicle(seed, airframe, float(chance.uniform(*LATENCIES)))
+    latency = float(chance.uniform(*LATENCIES))
+    roll, pitch = (moment * (1 + chance.uniform(-MOMENT, MOMENT)) for moment in nominal.velocity_moment)
+    return DrawnVehicle(seed, replace(airframe, velocity_moment=(roll, pitch)), latency)
+
+
+def unknown_vehicle(limits: Limits) -> Limits:
+    """Return limits whose airframe states how widely vehicles are drawn, so that the hover check lets them fly."""
+    spread = replace(limits.airframe.spread, mass=MASS + 0.02, thrust_scale=THRUST + 0.02, velocity_moment=MOMENT)
+    return replace(limits, airframe=replace(limits.airframe, spread=spread))
 
 
 def fly_drawn(drawn: DrawnVehicle, mission: Mission, folder: Path, seed: int) -> tuple[Record, SteppedFlight]:
@@ -136,7 +144,7 @@ def fly_drawn(drawn: DrawnVehicle, mission: Mission, folder: Path, seed: int) ->
 
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per vehicle: its seed. Raises what planning raises."""
-    limits = limits_for(settings.path_file)
+    limits = unknown_vehicle(limits_for(settings.path_file))
     missions = prepare_mission(settings.path_file, limits), prepare_mission(settings.next_file, limits)
     cases = {str(seed): seed for seed in range(settings.seed, settings.seed + settings.vehicles)}
     return Work(cases, partial(measure, missions=missions, next_file=settings.next_file), StudiedVehicle)
@@ -174,8 +182,8 @@ def _limits_of(limits: Limits, found: Identification) -> Limits:
 
 def _limits(limits: Limits, airframe: Airframe, latency: float) -> Limits:
     """Return the limits that the same safety.yaml gives for another vehicle and latency."""
-    old = limits.airframe
-    reserve = (limits.plan.motor_thrust_min - old.motor_thrust_min) / (old.motor_thrust_max - old.motor_thrust_min)
+    least, most = limits.airframe.thrust_range
+    reserve = (limits.plan.motor_thrust_min - least) / (most - least)
     plan = replace(limits.plan, **within_reserve(airframe, reserve))
     return replace(limits, airframe=airframe, plan=plan, pose=replace(limits.pose, latency=latency))
 
@@ -183,8 +191,7 @@ def _limits(limits: Limits, airframe: Airframe, latency: float) -> Limits:
 def _errors(found: Identification, drawn: DrawnVehicle, nominal: Airframe) -> tuple[dict[str, float], dict[str, float]]:
     """Return errors and stated uncertainties, in % or ms, by quantity."""
     true, quantities = drawn.airframe, found.quantities
-    ratio = (true.motor_thrust_max / true.mass) / (nominal.motor_thrust_max / nominal.mass)
-    thrust = true.motor_thrust_max / nominal.motor_thrust_max
+    ratio, thrust = (true.thrust_scale / true.mass) / (nominal.thrust_scale / nominal.mass), true.thrust_scale
     truths = {
         "thrust": (quantities["thrust scale"], thrust, 100 / thrust),
         "thrust over mass": (quantities["thrust over mass"], ratio, 100 / ratio),
@@ -214,7 +221,7 @@ def _deviation(flown: SteppedFlight, mission: Mission) -> float:
 def tables(settings: Settings, rows: list[StudiedVehicle]) -> Iterator[Table]:
     """Yield the errors of identification, and the deviations of the next flights."""
     done = [vehicle for vehicle in rows if not vehicle.reason]
-    title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles"
+    title = f"Identified from one flight each, {len(done)} of {len(rows)} vehicles, moment ±{100 * MOMENT:.0f} %"
     yield table("errors", title, ERROR_COLUMNS, list(_accuracy(done)))
     yield table("next-flight", "The next flight", NEXT_COLUMNS, list(_next_flights(done)), by=("vehicle",))
 

@@ -82,6 +82,7 @@ def work(settings: Settings, run: Run) -> Work:
 def measure(path_file: Path, bodies: Sequence[OtherBody] = BODIES) -> list[ComparedFlight]:
     """Fly the setpoints of a path with each body. Raises InputError if none of them is available."""
     limits = limits_for(path_file)
+    limits = replace(limits, airframe=limits.airframe.simplified())
     planned = plan_flight(path_file, limits)
     encoded, trajectory, airframe = encode_flight(planned), planned.plan.trajectory, limits.airframe
     rows = []

@@ -139,7 +139,7 @@ def rungs(kind: Airframe, found: Airframe) -> dict[str, tuple[Airframe, bool]]:
 
     Each adds a piece of physics.
     """
-    plain = replace(kind, velocity_moment=(0.0, 0.0), lift_with_speed=0.0, thrust_scale=1.0, thrust_curvature=0.0)
+    plain = replace(kind.simplified(), voltage_sag=kind.voltage_sag)
     scaled = replace(plain, thrust_scale=found.thrust_scale, thrust_curvature=found.thrust_curvature)
     still = replace(found, velocity_moment=(0.0, 0.0))
     models = ((plain, False), (scaled, False), (still, False), (still, True), (found, True))

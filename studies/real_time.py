@@ -25,6 +25,7 @@ from cfplan.simulation.lab.room import RoomSettings
 from cfplan.simulation.lab.sim_driver import SimDriver
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+from cfplan.vehicle.airframe import Airframe
 
 LATENESS_CHECK = "this computer's lateness"
 RETRIES = 2  # after refusals for lateness alone
@@ -38,6 +39,7 @@ class Conditions:
     loss: float = 0.0  # fraction of the radio's transmissions
     pose_noise: float = 0.001  # m, standard deviation of each axis
     seed: int = 0  # of all noise
+    airframe: Airframe | None = None  # of the vehicle; None: as the mission's limits state it
 
     def __post_init__(self) -> None:
         if not (0 <= self.loss < 1 and 0 <= self.pose_noise < _MOST_NOISE):
@@ -76,7 +78,7 @@ def simulated_lab(mission: Mission, conditions: Conditions) -> Lab:
     """Start a lab with these conditions."""
     noise, seed = conditions.pose_noise, conditions.seed
     lab = start_lab(
-        mission.limits.airframe,
+        conditions.airframe or mission.limits.airframe,
         vehicle=VehicleSettings(seed=seed),
         room=RoomSettings(ViconSettings(position_noise=noise, seed=seed)),
     )

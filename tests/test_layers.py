@@ -20,7 +20,7 @@ LAYERS = [
 MODULES = "its other modules"
 ROOMS = {
     "planners": [MODULES, "solver", "expert", "baselines"],
-    "flight": [MODULES, "setpoints", "on_board", "radio", "mocap", "pilot"],
+    "flight": [MODULES, "setpoints", "on_board", "radio", "mocap", "pilot", "fleet"],
     "simulation": ["timed_fault", "engine", "virtual_crazyflie", "virtual_vicon", "lab", MODULES],
     "recording": ["plausible", "importers", MODULES, "rerun", "report", "mavlink"],
 }

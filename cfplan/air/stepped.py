@@ -70,9 +70,12 @@ class SteppedPlanner:
 
     @property
     def pending(self) -> frozenset[int]:
-        """Return the numbers of the requests that are not answered yet."""
+        """Return the numbers of the requests that are not answered yet.
+
+        A request whose proposal the pilot left unanswered has been refused.
+        """
         state = self.state
-        at_pilot = None if state.sent is None else state.sent.job.request
+        at_pilot = None if state.sent is None or state.sent.unanswered else state.sent.job.request
         in_hand = None if state.job is None else state.job.request
         waiting = None if state.waiting is None else state.waiting[0]
         return frozenset(each.number for each in (at_pilot, in_hand, waiting) if each is not None)

@@ -51,37 +51,39 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     "--limits",
     default="drawn",
     show_default=True,
-    help="Limits and vehicle: drawn for each path, or a set: hardware (2 m/s), simulation or paper (5 m/s).",
+    help="Limits and vehicle: drawn (for each path), hardware (2 m/s), simulation or paper (5 m/s).",
 )
-@click.option("--safety", type=click.Path(path_type=Path), help="Vehicle and plan limits of this safety.yaml instead.")
+@click.option(
+    "--safety", type=click.Path(path_type=Path), help="Take vehicle and limits from this safety.yaml instead."
+)
 @click.option("--seed", type=int, default=0, show_default=True)
 @click.option(
     "--box",
     "boxes",
     callback=_boxes,
     multiple=True,
-    help="Sides of a box to draw waypoints in, m, e.g. 4.5x8x2, instead of paths of all families; repeatable.",
+    help="Draw waypoints in a box of this size, m, e.g. 4.5x8x2, instead of all path families; repeatable.",
 )
 @click.option(
-    "--waypoints", callback=_range, default="3-6", show_default=True, help="Least and greatest number of waypoints."
+    "--waypoints", callback=_range, default="3-6", show_default=True, help="Range of the number of waypoints."
 )
 @click.option(
     "--shape",
     type=click.Choice(["min-snap", "fastest", "any"]),
     default="min-snap",
     show_default=True,
-    help="Path through the waypoints: of least snap, the fastest in a drawn room, or either.",
+    help="Path through the waypoints: minimum snap, the fastest in a drawn room, or any of the two.",
 )
 @click.option("--nodes", type=int, default=100, show_default=True, help="Grid intervals.")
 @click.option("--yaw", type=click.Choice(["any", "fixed", "tangent", "free"]), default="any", show_default=True)
-@click.option("--epsilon", type=float, default=0.0, help="Perturb copies by at most this at every node, m.")
-@click.option("--copies", type=int, default=0, help="Perturbed copies of each path.")
+@click.option("--epsilon", type=float, default=0.0, help="Largest displacement of a copy's nodes, m.")
+@click.option("--copies", type=int, default=0, help="Number of perturbed copies of each path.")
 @click.option(
     "--relabel",
     type=click.Choice(["solve", "keep"]),
     default="solve",
     show_default=True,
-    help="Solve each copy, or keep the clean path's label.",
+    help="Label of a copy: solve anew, or keep that of the clean path.",
 )
 @click.option(
     "--planner",
@@ -90,8 +92,8 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
     show_default=True,
     help="Planner that computes the labels.",
 )
-@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine.")
-@click.option("--scheduler", help="Label on a Dask cluster instead: tcp://host:port.")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
+@click.option("--scheduler", help="Address of a Dask cluster to label on instead, tcp://host:port.")
 @options.as_json
 def make(folder: Path, workers: int, scheduler: str | None, as_json: bool, **what: Any) -> None:
     """Make the dataset DIR, or complete it.

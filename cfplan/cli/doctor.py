@@ -28,7 +28,7 @@ OPTIONAL = {
 
 
 @click.command(short_help="Check versions, packages, machine code and radio.", epilog="Example: cfplan doctor --json")
-@click.option("--warm-up", "warm", is_flag=True, help="First compile everything that flights need, side by side.")
+@click.option("--warm-up", "warm", is_flag=True, help="First compile everything that flights need, in parallel.")
 @click.option("--safety", "safety_file", type=click.Path(path_type=Path), help="safety.yaml.  [default: the nearest]")
 @click.option("--uri", help="Vehicle whose firmware and settings to check as preflight does; nothing is changed.")
 @options.as_json

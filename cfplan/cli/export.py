@@ -30,7 +30,7 @@ Examples:
     help="Polynomial CSV; the vehicle's trajectory memory, compressed if necessary or always; or a CSV of states.",
 )
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write.")
-@click.option("--plain", is_flag=True, help="The plan's motion alone, without corrections for the firmware.")
+@click.option("--plain", is_flag=True, help="Export the plan's motion without corrections for the firmware.")
 @click.option(
     "--pieces", type=click.IntRange(1, 255), help="Maximum number of pieces.  [default: 31, as a vehicle holds]"
 )

@@ -48,20 +48,20 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
 @click.option(
     "--on-board",
     is_flag=True,
-    help="Upload the flight as polynomials for the vehicle's own commander; only poses are streamed.",
+    help="Upload the flight as polynomials for the vehicle's own commander, and stream only poses.",
 )
 @click.option(
     "--after",
     multiple=True,
     metavar="RECORD",
     type=click.Path(path_type=Path),
-    help="Correct setpoints by what repeated in earlier flights of this plan; once per record, in order.",
+    help="Record of an earlier flight of this plan, to correct its repeated deviation; one per flight, in order.",
 )
 @click.option("--uri", default="sim://0", show_default=True, help="The vehicle; sim:// is the virtual Crazyflie.")
 @click.option(
     "--mocap",
     "mocap_uri",
-    help="The vehicle in motion capture, e.g. vicon://192.168.1.2/cf1. sim:// has a virtual Vicon, "
+    help="Motion capture system and tracked body, e.g. vicon://192.168.1.2/cf1. sim:// has a virtual Vicon, "
     "vicon://lab/cf1; vicon-sdk://lab/cf1 reads it with Vicon's SDK.",
 )
 @click.option(
@@ -69,12 +69,12 @@ Keys in the air: space lands, Esc cuts the motors; Ctrl-C once lands, twice cuts
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("records"),
     show_default=True,
-    help="Folder for the flight's record, which is a new folder in it.",
+    help="Folder in which the record's folder is created.",
 )
 @click.option("--live", is_flag=True, help="Show the flight live in rerun.")
 @click.option(
     "--mavlink",
-    help="Address of a ground station that may watch and stop the flight, e.g. udp:127.0.0.1:14550.",
+    help="Address of a ground station that watches and may stop the flight, e.g. udp:127.0.0.1:14550.",
 )
 @click.option("--yes", is_flag=True, help="Do not ask before hardware flies.")
 @options.as_json

@@ -65,7 +65,7 @@ def fly_waypoints(
 
     def reply(text: str) -> None:
         answers.append(text)
-        steps.say(text)
+        steps.print(text)
 
     with ExitStack() as stack:
         lines, watchers = stack.enter_context(opened_lines(place, reply)), _Watchers(watched, stack)
@@ -76,7 +76,7 @@ def fly_waypoints(
         stack.callback(refuse_rest, lines)
         with suppress(FlightEndedError), vehicle:  # the outcome has the reason
             vehicle.take_off()
-            steps.say("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
+            steps.print("in the air: one waypoint a line, as 1.0 0.0 1.2; land lands")
             steer_by_lines(vehicle, lines)
     return _print_result(vehicle, answers, as_json)
 

@@ -53,7 +53,7 @@ def init(folder: Path, room: str, vehicle: str, mass: float | None, as_json: boo
         _write(folder, texts)
         load_limits(folder / options.SAFETY_FILE)
         results.append(", ".join(str(folder / name) for name in texts))
-    steps.say(f"measure the room, correct safety.yaml, then: cfplan fly {folder / _PATH_FILE}")
+    steps.print(f"measure the room, correct safety.yaml, then: cfplan fly {folder / _PATH_FILE}")
     if as_json:
         print_json({"files": [str(folder / name) for name in texts]})
 

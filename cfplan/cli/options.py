@@ -58,7 +58,7 @@ def _path(name: str, check: Callable) -> Callable:
         is_eager=True,  # processed before the path that it replaces
         expose_value=False,
         callback=_remember_example,
-        help="Instead of a path: one that comes with cfplan, e.g. figure8.",
+        help="Instead of a path: an example that comes with cfplan, e.g. figure8.",
     )
     return lambda command: instead(argument(command))
 
@@ -79,7 +79,9 @@ class _SpeedFactor(click.FloatRange):
         try:
             return super().convert(value, param, ctx)
         except click.BadParameter:
-            self.fail(f"{value} is no share of the allowed speed, above 0 and at most 1; it is not in m/s.", param, ctx)
+            self.fail(
+                f"{value} is not a fraction of the allowed speed, above 0 and at most 1; it is not in m/s.", param, ctx
+            )
 
 
 _PLANNING = (

@@ -80,7 +80,7 @@ class Steps:
         if not self.as_json:
             click.echo(_line(styled("✗", "red"), f"{name:<12} ", text))
 
-    def say(self, text: str = "") -> None:
+    def print(self, text: str = "") -> None:
         """Print a line that does not belong to a step."""
         if not self.as_json:
             click.echo(text)

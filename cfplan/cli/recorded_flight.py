@@ -54,7 +54,7 @@ def fly_and_record(
             )
         except CfplanError:
             if progress.heard_vehicle:
-                steps.say(f"what was recorded: {folder}")
+                steps.print(f"record of the incomplete flight: {folder}")
             else:
                 shutil.rmtree(folder)  # there was no flight
             raise

@@ -107,7 +107,7 @@ class Files:
         """Raise InputError if the options do not go together, or a figure could not be written."""
         if self.moment is not None and (self.png is None or not abs(self.moment) < 1e6):
             raise InputError("--at says when a picture is taken, in s", hint="add --png flight.png")
-        from cfplan.files.whole import check_new_file
+        from cfplan.files.atomic import check_new_file
 
         for file, suffix in ((self.save, ".rrd"), (self.png, ".png")):
             if file is not None:

@@ -20,7 +20,7 @@ _USUAL = "crazyflie-2.1+"
 
 
 @click.command(
-    short_help="Predict logged flights, and compare with what the vehicle did.",
+    short_help="Predict logged flights and compare them with the log.",
     epilog="""\b
 Examples:
   cfplan validate log76 --gains info76.yaml --mass 0.0375

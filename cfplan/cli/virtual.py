@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from cfplan.safety.limits import Limits
     from cfplan.simulation.lab.lab import Lab, Truth
 
-_LOOK = 0.05  # s
-_MOST = 5  # vehicles, which also stand apart in a small space
-_APART = 1.0  # m between vehicles that stand side by side
+_POLL_PERIOD = 0.05  # s
+_MAX_VEHICLES = 5  # vehicles, which also stand apart in a small space
+_VEHICLE_SPACING = 1.0  # m between vehicles that stand side by side
 _LAST_PORT = 65535
 FLOW_DECK = "deck.bcFlow2"  # firmware parameter, 1 if the deck was detected at start
 LOCKED = (
-    "the supervisor has locked: the last flight ended without a notice that setpoints stop, and motors stay off "
+    "the supervisor has locked: the last flight ended without a stop notice, so motors stay off "
     "until the vehicle is restarted (key r; without a keyboard, end this command and start it again)"
 )
 
@@ -41,7 +41,7 @@ LOCKED = (
     epilog="""\b
 Examples:
   cfplan virtual                                  then connect to udp://127.0.0.1:19850
-  cfplan virtual --live                           the same, seen in rerun
+  cfplan virtual --live                           the same, shown in rerun
   cfplan virtual --vicon 8010                     with poses by a virtual Vicon, as in a lab; in a second terminal:
   cfplan fly first.yaml --uri udp://127.0.0.1:19850 --mocap vicon://127.0.0.1:8010/cf1
   cfplan virtual --count 3 --vicon 8010           three in one room: cf1, cf2 and cf3
@@ -53,7 +53,7 @@ Examples:
     help="UDP port; cfclient scans 19850 to 19859. Each further vehicle takes the next one.",
 )  # fmt: skip
 @click.option(
-    "--count", type=click.IntRange(1, _MOST), default=1, show_default=True,
+    "--count", type=click.IntRange(1, _MAX_VEHICLES), default=1, show_default=True,
     help="Vehicles in the room, a metre apart along y. They do not collide.",
 )  # fmt: skip
 @click.option(
@@ -123,7 +123,7 @@ class VirtualRoom:
         """Return their positions, m: the first at the origin, the others beside it along y, inside the space."""
         space = self.limits.space
         reach = min(-space.low[1], space.high[1]) - space.margin
-        apart = min(_APART, max(reach, 0.0) / max(self.count // 2, 1))
+        apart = min(_VEHICLE_SPACING, max(reach, 0.0) / max(self.count // 2, 1))
         return [(0.0, apart * ((k + 1) // 2) * (1 if k % 2 else -1), 0.0) for k in range(self.count)]
 
     def require_ports(self) -> None:
@@ -176,7 +176,7 @@ def _serve(room: VirtualRoom, end: float, view: "LiveView | None", typed: Callab
     with started as lab:
         click.echo(room.describe(lab), err=True)
         while time.monotonic() < end:
-            time.sleep(_LOOK)
+            time.sleep(_POLL_PERIOD)
             if b"r" in typed():
                 return True
             if not lab.alive:

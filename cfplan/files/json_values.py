@@ -1,4 +1,4 @@
-"""Values as JSON knows them: what is not finite is null, as JSON has no word for it."""
+"""Values as JSON: numbers that are not finite become null, as JSON cannot write them."""
 
 import math
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ def json_value(value: Any) -> Any:
     return value
 
 
-def whole_characters(value: Any) -> Any:
-    """Return a document read from JSON with `?` for each half of a surrogate pair, which no file or terminal takes."""
+def replace_surrogates(value: Any) -> Any:
+    """Return a document read from JSON with `?` for each lone surrogate, which no file or terminal accepts."""
     if isinstance(value, str):
         return value.encode("utf-8", "replace").decode("utf-8")
     if isinstance(value, dict):
-        return {whole_characters(key): whole_characters(item) for key, item in value.items()}
+        return {replace_surrogates(key): replace_surrogates(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [whole_characters(item) for item in value]
+        return [replace_surrogates(item) for item in value]
     return value

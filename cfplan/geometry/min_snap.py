@@ -175,7 +175,7 @@ def derivatives_at(points: NDArray, times: NDArray, start: NDArray | None, rest_
                 f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
                 f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
                 where=f"waypoint {far + 2}",
-                hint="correct the coordinate that slipped, or add points between",
+                hint="correct the mistyped coordinate, or add points between",
             )
         derivatives[first:last] = solution.reshape(-1, 3, 3)
     return derivatives
@@ -241,8 +241,8 @@ def _solve_scaled(matrix: NDArray, force: NDArray) -> tuple[NDArray, bool]:
     """Solve with the diagonal scaled to 1; both arrays are changed. Return the solution, and whether there is one."""
     scale = 1.0 / np.sqrt(matrix[:, 0])
     for row in range(len(matrix)):
-        for off in range(min(row, matrix.shape[1] - 1) + 1):
-            matrix[row, off] *= scale[row] * scale[row - off]
+        for offset in range(min(row, matrix.shape[1] - 1) + 1):
+            matrix[row, offset] *= scale[row] * scale[row - offset]
         for axis in range(3):
             force[row, axis] *= scale[row]
     solution, definite = solve_columns(matrix, force)

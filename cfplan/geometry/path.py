@@ -44,7 +44,7 @@ class Path:
             raise InputError(
                 "breaks or coefficients of a path are not finite numbers",
                 where="path",
-                hint="its points are too many, too close or too far apart to be numbers; give others",
+                hint="there are too many points, or they are too close or too far apart",
             )
         if breaks[0] != 0.0 or (np.diff(breaks) <= 0.0).any():
             raise InputError("breaks of a path must ascend from 0", where="path", hint="give each piece a length")

@@ -258,7 +258,7 @@ def _check_choice(content: _Content, places: Places, given: str, through: bool) 
     for key in ("shape", "times", "corridor"):
         if key in content.model_fields_set and not through:
             raise InputError(
-                f"{key} is for waypoints and points only: `{given}` is flown as it is given",
+                f"{key} is for waypoints and points only: `{given}` already defines its shape",
                 where=places.where_key(key),
                 hint=f"leave {key} out, or give waypoints or points",
             )

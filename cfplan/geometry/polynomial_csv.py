@@ -55,9 +55,9 @@ def read_polynomials(file: pathlib.Path, *, laps: int = 1) -> tuple[Any, ...]:
     if len(samples) > _MOST_SAMPLES:
         raise InputError(f"more than {_MOST_SAMPLES} samples", where=str(file), hint="fly fewer laps")
     path = smooth_through(samples)
-    off = 1000 * distances(path, samples).max()
+    millimetres = 1000 * distances(path, samples).max()
     where = f"snap jumps at {jumps} of {len(durations) - 1} joints"
-    return path, corners, f"{where}: drawn smoothly through samples, within {off:.1f} mm"
+    return path, corners, f"{where}: drawn smoothly through samples, within {millimetres:.1f} mm"
 
 
 def _sampled(durations: NDArray, table: NDArray) -> NDArray:

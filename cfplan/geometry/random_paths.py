@@ -12,7 +12,7 @@ from cfplan.geometry.polynomials import padded, shifted
 
 SPACING = 0.5  # m, least distance between waypoints in a row
 KNOT_SPACING = 1.0  # s of nominal time between knots of a perturbation
-_TRIES = 1000  # per waypoint
+_DRAWS_PER_WAYPOINT = 1000  # per waypoint
 _DEGREE = 5  # of a perturbation: C⁴, as a path must be
 
 
@@ -52,7 +52,7 @@ def random_waypoints(
     random = generator(seed)
     count = int(random.integers(count_range[0], count_range[1], endpoint=True))
     points = [random.uniform(low, high)]
-    for _ in range(_TRIES * count):
+    for _ in range(_DRAWS_PER_WAYPOINT * count):
         if len(points) == count:
             break
         point = random.uniform(low, high)

@@ -13,12 +13,12 @@ from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 
 STEP = 0.08  # m along the way between points, and over which samples are averaged: bends of 0.5 m keep within 2 mm
-_SHORT = 24  # points of a way that is too short for so many steps
-_CHAIN = 0.25  # of a step: samples nearer than that to the last one that counted do not count as way
-_QUICKEST = 30.0  # m/s between two samples: faster is another marker, or another unit
-_RESTING = 0.03  # m/s, slower than which it rests
+_MIN_POINTS = 24  # points of a way that is too short for so many steps
+_MIN_STEP_FRACTION = 0.25  # of a step: samples nearer than that to the last one that counted do not count as way
+_MAX_SPEED = 30.0  # m/s between two samples: faster is another marker, or another unit
+_REST_SPEED = 0.03  # m/s, slower than which it rests
 _SHORTEST_REST = 0.3  # s
-_MANY = 10  # samples of which a mean is better than the first
+_MIN_REST_SAMPLES = 10  # samples of which a mean is better than the first
 _LONGEST_GAP = 0.5  # s without samples that need not be told
 
 
@@ -31,11 +31,11 @@ class TimedSamples:
 
     def points(self) -> NDArray:
         """Return points, (K, 3) m, along the way: the first and the last sample, and averages between."""
-        counts = _chain(self.position, STEP * _CHAIN)
+        counts = _thinned(self.position, STEP * _MIN_STEP_FRACTION)
         way = float(np.linalg.norm(np.diff(self.position[counts], axis=0), axis=1).sum())
-        step = min(STEP, way / _SHORT)
+        step = min(STEP, way / _MIN_POINTS)
         if step < STEP:
-            counts = _chain(self.position, step * _CHAIN)
+            counts = _thinned(self.position, step * _MIN_STEP_FRACTION)
         along = np.zeros(len(self.position))
         lengths = np.linalg.norm(np.diff(self.position[counts], axis=0), axis=1)
         along[counts[1:]] = lengths
@@ -55,23 +55,23 @@ class TimedSamples:
     def _end(self, which: NDArray, index: int) -> NDArray:
         """Return where the motion begins or ends, (3,) m: the mean of a rest, as noise averages out of that."""
         place = self.position[which]
-        rests = len(place) > _MANY and float(np.ptp(place, axis=0).max()) < STEP / 4
+        rests = len(place) > _MIN_REST_SAMPLES and float(np.ptp(place, axis=0).max()) < STEP / 4
         return np.asarray(place.mean(axis=0) if rests else self.position[index])
 
     def losses(self, path: Path) -> tuple[str, ...]:
         """Return what the path does not keep of the motion, a few words each."""
-        told = [f"timing is not kept: {self.time[-1] - self.time[0]:.1f} s of {len(self.time)} samples"]
+        found = [f"timing is not kept: {self.time[-1] - self.time[0]:.1f} s of {len(self.time)} samples"]
         rests = self._rests()
         if rests:
-            told.append(f"{len(rests)} rests are left out, {sum(rests):.1f} s together")
+            found.append(f"{len(rests)} rests are left out, {sum(rests):.1f} s together")
         gap = float(np.diff(self.time).max())
         if gap > _LONGEST_GAP:
-            told.append(f"nothing is known for {gap:.1f} s before {self.time[1 + np.argmax(np.diff(self.time))]:.1f} s")
-        off = distances(path, self.position)
-        told.append(
-            f"samples lie up to {1000 * off.max():.0f} mm from the path, {1000 * np.median(off):.1f} mm in median"
-        )
-        return tuple(told)
+            found.append(
+                f"there are no samples for {gap:.1f} s before {self.time[1 + np.argmax(np.diff(self.time))]:.1f} s"
+            )
+        apart = 1000 * distances(path, self.position)
+        found.append(f"samples lie up to {apart.max():.0f} mm from the path, {np.median(apart):.1f} mm in median")
+        return tuple(found)
 
     def _rests(self) -> list[float]:
         """Return how long the motion rests, s, each time; at its ends too."""
@@ -81,7 +81,7 @@ class TimedSamples:
         if window >= len(self.time):
             return []
         pace = np.linalg.norm(self.position[window:] - self.position[:-window], axis=1)
-        slow = pace / (self.time[window:] - self.time[:-window]) < _RESTING
+        slow = pace / (self.time[window:] - self.time[:-window]) < _REST_SPEED
         edges = np.flatnonzero(np.diff(np.concatenate([[0], slow.astype(int), [0]])))
         return [
             float(self.time[min(b - 1 + window, len(self.time) - 1)] - self.time[a]) for a, b in edges.reshape(-1, 2)
@@ -104,7 +104,7 @@ def timed_samples(rows: NDArray, lines: list[int], file: str) -> TimedSamples:
             hint="the first number of a row is the time in seconds, and rises from row to row",
         )  # fmt: skip
     lengths = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    if (lengths > _QUICKEST * steps).any():
+    if (lengths > _MAX_SPEED * steps).any():
         bad = int(np.argmax(lengths / steps))
         raise InputError(
             f"the motion jumps by {lengths[bad]:.3g} m within {steps[bad]:.3g} s",
@@ -113,9 +113,7 @@ def timed_samples(rows: NDArray, lines: list[int], file: str) -> TimedSamples:
         )  # fmt: skip
     extent = float(np.ptp(position, axis=0).max())
     if extent < STEP:
-        raise InputError(
-            f"the motion stays within {extent:.3f} m", where=file, hint="give metres, and a motion that goes somewhere"
-        )
+        raise InputError(f"the motion stays within {extent:.3f} m", where=file, hint="give metres, and a longer motion")
     return TimedSamples(time, position)
 
 
@@ -125,17 +123,17 @@ def distances(path: Path, position: NDArray) -> NDArray:
 
     s = np.linspace(0.0, path.end, max(2, int(path.length / 0.005)))
     nearest = s[KDTree(path(s)).query(position)[1]]
-    off, tangent = position - path(nearest), path(nearest, 1)
-    along = np.sum(off * tangent, axis=1) / np.maximum(np.sum(tangent**2, axis=1), 1e-12)  # 0 at the ends, at rest
-    return np.asarray(np.linalg.norm(off - along[:, None] * tangent, axis=1))
+    distance, tangent = position - path(nearest), path(nearest, 1)
+    along = np.sum(distance * tangent, axis=1) / np.maximum(np.sum(tangent**2, axis=1), 1e-12)  # 0 at the ends, at rest
+    return np.asarray(np.linalg.norm(distance - along[:, None] * tangent, axis=1))
 
 
-def _chain(position: NDArray, least: float) -> NDArray:
+def _thinned(position: NDArray, least: float) -> NDArray:
     """Return the indices of samples each at least so far, m, from the one before in the chain; and of the last."""
     chosen, here = [0], position[0]
     for index in range(1, len(position)):
-        off = position[index] - here
-        if off @ off >= least * least:
+        distance = position[index] - here
+        if distance @ distance >= least * least:
             chosen.append(index)
             here = position[index]
     if chosen[-1] != len(position) - 1:

@@ -4,11 +4,11 @@ import json
 from dataclasses import fields
 from pathlib import Path
 
-from cfplan.files.whole import check_new_file, write_whole
+from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.identification.quantities import Identification
 from cfplan.vehicle.airframe import Airframe, Spread
 
-_KEPT_DIGITS = 7
+_DIGITS = 7
 _UNITS = {
     "mass": "kg, with the battery",
     "inertia": "kg m²",
@@ -62,9 +62,9 @@ def check_target(file: Path, *, overwrite: bool = False) -> None:
 def write_airframe(airframe: Airframe, file: Path, *, overwrite: bool = False) -> None:
     """Write the airframe's file, whole or not at all. Raises InputError where it exists or cannot be written."""
     check_target(file, overwrite=overwrite)
-    write_whole(file, airframe_text(airframe).encode())
+    write_atomically(file, airframe_text(airframe).encode())
 
 
 def _number(value: float) -> str:
-    text = f"{value:.{_KEPT_DIGITS}g}"
+    text = f"{value:.{_DIGITS}g}"
     return text.replace("e", ".0e") if "e" in text and "." not in text else text  # YAML reads 1e-05 as text

@@ -24,8 +24,8 @@ STEP = 0.001  # s, of the grid on which everything is integrated
 _MARGIN = 0.2  # s of the grid before and behind the flight
 _SPAN = 12  # poses over which turns are compared: 0.12 s at 100 Hz
 # rad rms over such a span, from which turns are told from noise; share of it by which poses may turn otherwise
-_TURNS, _UNLIKE = 0.02, 0.6
-_NOTHING_KNOWN, _REGULAR = 1e-6, 1e-9
+_MIN_TURN, _MAX_TURN_MISFIT = 0.02, 0.6
+_MIN_INFORMATION, _REGULARISATION = 1e-6, 1e-9
 _SMOOTHING = 0.25  # s, by which the slow difference of poses and gyroscope is smoothed
 
 
@@ -66,7 +66,7 @@ def fit_attitude(signals: FlightSignals) -> AttitudeFit:
     found = least_squares(residual, np.zeros(7), x_scale=[0.01] * 7, loss="soft_l1", f_scale=0.02)
     spread = found.fun @ found.fun / max(len(found.fun) - 7, 1)
     turned_by = np.sqrt(np.mean((_at(grid, turned, begin).inv() * _at(grid, turned, end)).as_rotvec() ** 2))
-    if turned_by > _TURNS and np.sqrt(spread) > _UNLIKE * turned_by:
+    if turned_by > _MIN_TURN and np.sqrt(spread) > _MAX_TURN_MISFIT * turned_by:
         raise InputError(
             "the poses do not turn as the vehicle's gyroscope says",
             hint="is the body that was tracked the vehicle? `cfplan replay` shows both",
@@ -92,8 +92,8 @@ def smooth_attitude(signals: FlightSignals, fit: AttitudeFit) -> Rotation:
 
 def inverse_information(information: NDArray) -> NDArray:
     """Return the inverse of an information matrix (N, N): large where nothing is known, in units that differ widely."""
-    size = np.sqrt(np.maximum(np.diag(information), _NOTHING_KNOWN))
-    scaled = information / np.outer(size, size) + _REGULAR * np.eye(len(size))
+    size = np.sqrt(np.maximum(np.diag(information), _MIN_INFORMATION))
+    scaled = information / np.outer(size, size) + _REGULARISATION * np.eye(len(size))
     return np.linalg.inv(scaled) / np.outer(size, size)
 
 

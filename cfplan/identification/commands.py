@@ -93,7 +93,7 @@ def _law(signals: FlightSignals, estimate: NDArray, time: NDArray, delay: float,
     damping = np.array([gains.kd_xy, gains.kd_xy, gains.kd_z])
     force = airframe.mass * (wanted[:, 6:9] + [0.0, 0.0, GRAVITY])
     force += stiffness * (wanted[:, 0:3] - believed[:, 0:3]) + damping * (wanted[:, 3:6] - believed[:, 3:6])
-    return np.einsum("ni,ni->n", force, believed[:, 6:9]) / airframe.motor_thrust_max
+    return np.einsum("ni,ni->n", force, believed[:, 6:9]) / (airframe.motor_thrust_max * airframe.thrust_scale)
 
 
 def _nearest(signals: FlightSignals) -> NDArray:

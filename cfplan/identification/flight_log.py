@@ -18,7 +18,7 @@ from cfplan.vehicle.airframe import GRAVITY
 STATE = 13  # columns of the state
 FEWEST, SHORTEST = 200, 2.0  # records; s
 LONGEST_GAP = 0.5  # s without a record, beyond which a controller's integrals cannot be followed
-_GAP, _BESIDE = 0.03, 0.15  # s without a record that make a gap; s beside a gap that are left out
+_GAP, _GAP_MARGIN = 0.03, 0.15  # s without a record that make a gap; s beside a gap that are left out
 _RATE = 90.0  # 1/s, least rate of records for recomputing the controller
 _FASTEST_TURN = np.radians(80.0)  # rad of tilt beyond which a vehicle has crashed
 _COMMANDS = (("thrustSI", "thrustSi"), ("torquex",), ("torquey",), ("torquez",))  # of ctrlLee, by firmware
@@ -64,7 +64,7 @@ class FlightLog:
         """Return which times, (K,) s, are not beside a gap in the records."""
         away = np.ones(len(time), dtype=bool)
         for k in np.flatnonzero(self.gaps > _GAP):
-            away &= (time < self.time[k] - _BESIDE) | (time > self.time[k + 1] + _BESIDE)
+            away &= (time < self.time[k] - _GAP_MARGIN) | (time > self.time[k + 1] + _GAP_MARGIN)
         return away
 
     def between(self, begin: float, end: float) -> "FlightLog":

@@ -17,12 +17,12 @@ from cfplan.identification.translation import BATTERY, LINEAR, FittedUnknowns, F
 from cfplan.recording.record import Record
 
 _POSE_NOISE = 1e-3  # m, of which the misfit is counted in the search; the uncertainties take what is found
-_SHIFT_DOUBT = 0.5e-3  # s, of the shift beyond what the gyroscope's noise says
+_SHIFT_STD = 0.5e-3  # s, of the shift beyond what the gyroscope's noise says
 _BATTERY_PRIOR = 0.1  # 1/V, standard deviation of the relative change of thrust: firmware makes up for the voltage
-_LAGS = (0.01, 0.3)  # s, between which the motor lag is sought
-_SHIFTS = 0.1  # s, at most
+_LAG_RANGE = (0.01, 0.3)  # s, between which the motor lag is sought
+_MAX_SHIFT = 0.1  # s, at most
 _LAG_STEP, _TIME_STEP = 2e-3, 1e-3  # s, of the derivatives
-_FEWEST_WINDOWS = 4
+_MIN_WINDOWS = 4
 _SCALE = np.array([0.05, 0.01, 0.005, 0.005])
 
 
@@ -35,7 +35,7 @@ def identify(records: Sequence[Record], *, mass: float | None = None) -> Identif
         raise InputError("no record", hint="name at least one")
     if mass is not None and not (math.isfinite(mass) and 0.001 <= mass <= 10.0):
         raise InputError(
-            f"{mass:g} kg is no vehicle's mass",
+            f"{mass:g} kg is not the mass of a vehicle",
             where="--mass",
             hint="weigh it with its battery, and write kilograms, as 0.0331",
         )
@@ -44,9 +44,9 @@ def identify(records: Sequence[Record], *, mass: float | None = None) -> Identif
     voltage = float(np.mean(np.concatenate([slow_voltage(flight) for flight in flights])))
     models = [flight_model(flight, voltage) for flight in flights]
     count = sum(len(model.windows) for model in models)
-    if count < _FEWEST_WINDOWS:
+    if count < _MIN_WINDOWS:
         raise InputError(
-            f"{count} s of flight without gaps in poses, logs and setpoints, and {_FEWEST_WINDOWS} are needed",
+            f"{count} s of flight without gaps in poses, logs and setpoints, and {_MIN_WINDOWS} are needed",
             where=str(records[0].folder),
             hint="fly flights/identify.yaml; `cfplan report` shows the gaps",
         )
@@ -72,7 +72,7 @@ class _Problem:
     def __init__(self, models: Sequence[FlightModel]):
         self.models = models
         self._expected = np.array([model.attitude.shift for model in models])
-        self._doubt = np.array([math.hypot(model.attitude.shift_deviation, _SHIFT_DOUBT) for model in models])
+        self._shift_stds = np.array([math.hypot(model.attitude.shift_deviation, _SHIFT_STD) for model in models])
 
     def start(self) -> NDArray:
         delays = [sum(model.command.delays) / 2 for model in self.models]
@@ -80,11 +80,11 @@ class _Problem:
         return np.concatenate([[self.models[0].signals.airframe.motor_time_constant], times.ravel()])
 
     def bounds(self) -> tuple[NDArray, NDArray]:
-        low, high = [_LAGS[0]], [_LAGS[1]]
+        low, high = [_LAG_RANGE[0]], [_LAG_RANGE[1]]
         for model in self.models:
             least, most = model.command.delays
-            low += [-_SHIFTS, least, 0.0]
-            high += [_SHIFTS, max(most, least + _TIME_STEP), PERIOD]
+            low += [-_MAX_SHIFT, least, 0.0]
+            high += [_MAX_SHIFT, max(most, least + _TIME_STEP), PERIOD]
         return np.array(low), np.array(high)
 
     def equations(self, unknown: NDArray) -> tuple[NDArray, NDArray, NDArray]:
@@ -102,13 +102,13 @@ class _Problem:
     def solve(self, unknown: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return the linear unknowns, the misfit (N,) m, the regressors and the windows."""
         measured, columns, windows = self.equations(unknown)
-        prior = np.diag(_POSE_NOISE / self._doubts())[[BATTERY]]
+        prior = np.diag(_POSE_NOISE / self._prior_stds())[[BATTERY]]
         linear = np.linalg.lstsq(np.vstack([columns, prior]), np.append(measured, 0.0), rcond=None)[0]
         return linear, measured - columns @ linear, columns, windows
 
     def residual(self, unknown: NDArray) -> NDArray:
         shifts = unknown[1:].reshape(-1, 3)[:, 0]
-        return np.concatenate([self.solve(unknown)[1] / _POSE_NOISE, (shifts - self._expected) / self._doubt])
+        return np.concatenate([self.solve(unknown)[1] / _POSE_NOISE, (shifts - self._expected) / self._shift_stds])
 
     def jacobian(self, unknown: NDArray) -> NDArray:
         return self._differences(self.residual, unknown)
@@ -135,19 +135,19 @@ class _Problem:
     def information(self, unknown: NDArray) -> NDArray:
         """Return what is known beforehand of the unknowns, as inverse variances."""
         known = np.zeros(LINEAR + len(unknown))
-        known[:LINEAR] = self._doubts() ** -2
+        known[:LINEAR] = self._prior_stds() ** -2
         low, high = self.bounds()
         uniform = 12.0 / (high - low) ** 2
         known[LINEAR + 1 :] = uniform[1:]
-        known[LINEAR + 1 :: 3] = self._doubt**-2
+        known[LINEAR + 1 :: 3] = self._shift_stds**-2
         return known
 
-    def _doubts(self) -> NDArray:
+    def _prior_stds(self) -> NDArray:
         """Return what is known of the linear unknowns beforehand, as standard deviations about zero."""
         airframe = self.models[0].signals.airframe
-        doubts = np.full(LINEAR, np.inf)
-        doubts[BATTERY] = _BATTERY_PRIOR * airframe.motor_thrust_max / airframe.mass
-        return doubts
+        stds = np.full(LINEAR, np.inf)
+        stds[BATTERY] = _BATTERY_PRIOR * airframe.motor_thrust_max / airframe.mass
+        return stds
 
 
 def fit_unknowns(models: Sequence[FlightModel]) -> FittedUnknowns:

@@ -43,7 +43,7 @@ def flight_of_record(record: Record, begin: float = 0.0, end: float = math.inf) 
     the record holds no flight, or too little of one.
     """
     signals = read_signals(record)
-    airframe, time = signals.airframe, signals.estimate_time - _late_by(signals)
+    airframe, time = signals.airframe, signals.estimate_time - _delay_of_setpoints(signals)
     inside = (time >= 0.0) & (time <= signals.duration)
     zero, time = float(time[inside][0]), time[inside] - float(time[inside][0])
 
@@ -106,7 +106,7 @@ def _reference(record: Record, zero: float) -> ReferenceMotion:
     return ReferenceMotion("setpoints as sent", motion.time, motion.rows, time + LINK_DELAY, rows)
 
 
-def _late_by(signals: FlightSignals) -> float:
+def _delay_of_setpoints(signals: FlightSignals) -> float:
     """Return the delay in the times of estimate messages, s, from estimated positions against poses."""
     shifts = np.arange(0.0, _LATEST, 0.001)
     places, known = signals.position, signals.pose_time
@@ -114,7 +114,7 @@ def _late_by(signals: FlightSignals) -> float:
     def apart(shift: float) -> float:
         at = np.column_stack([np.interp(known, signals.estimate_time - shift, column)
                               for column in signals.estimate[:, :3].T])  # fmt: skip
-        off = (at - places)[50:-50]
-        return float(np.mean((off - off.mean(axis=0)) ** 2))
+        distance = (at - places)[50:-50]
+        return float(np.mean((distance - distance.mean(axis=0)) ** 2))
 
     return float(min(shifts, key=apart))

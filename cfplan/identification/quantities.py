@@ -27,15 +27,15 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 # N, standard uncertainty: an accelerometer off by 0.3 m/s² steps the estimate at each pose by 3 mm/s, which the gain on
 # velocity, 0.4 N s/m, turns into thrust between the log's samples.
-_UNSEEN_THRUST = 1.2e-3
+_THRUST_STD = 1.2e-3
 _SOURCE = "identified from flights by cfplan identify; the rest: "
 # s: the quickest message of the log takes one, and its gyroscope's sample is as old; known to one.
-_LOG_DELAY, _LOG_DOUBT = 2e-3, 1e-3
-_PLAUSIBLE = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as believed is farther off
-_BEYOND_DOUBT = 2.0  # standard uncertainties
+_LOG_DELAY, _LOG_DELAY_STD = 2e-3, 1e-3
+_PLAUSIBLE_RATIO = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as believed is farther off
+_SIGNIFICANT_DEVIATIONS = 2.0  # standard uncertainties
 _LARGE_MISFIT = 0.004  # m rms
-_TELLS_DRAG, _TELLS_LAG = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
-_TELLS_BATTERY = 0.3  # V that the voltage must span
+_MAX_DRAG_STD, _MAX_LAG_STD = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
+_MIN_VOLTAGE_SPAN = 0.3  # V that the voltage must span
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,27 +48,27 @@ class IdentifiedQuantity:
     unit: str
     before: float  # what the airframe or safety.yaml said; NaN where nothing did
     digits: int
-    untold: str = ""  # why the records cannot tell; empty where they can
+    unobservable_reason: str = ""  # why the records cannot tell; empty where they can
     remark: str = ""  # what else to know
     scale: float = 1.0  # from SI to the unit
 
     def row(self) -> list[str]:
         """Return name, value with uncertainty, what was assumed before, and a remark, for people."""
         spec = f".{self.digits}f"
-        doubt = f" ± {shown(self.scale * self.deviation, spec)}" if math.isfinite(self.deviation) else ""
+        std = f" ± {shown(self.scale * self.deviation, spec)}" if math.isfinite(self.deviation) else ""
         before = f"{shown(self.scale * self.before, spec)}" if math.isfinite(self.before) else "–"
         return [
             self.name,
-            f"{shown(self.scale * self.value, spec)}{doubt} {self.unit}",
+            f"{shown(self.scale * self.value, spec)}{std} {self.unit}",
             before,
-            self.untold or self.remark,
+            self.unobservable_reason or self.remark,
         ]
 
     def to_dict(self) -> dict[str, Any]:
         """Return it in SI units."""
         numbers = {"value": self.value, "standard_uncertainty": self.deviation, "before": self.before}
         known = {name: value if math.isfinite(value) else None for name, value in numbers.items()}
-        return {**known, "untold": self.untold, "remark": self.remark}
+        return {**known, "unobservable_reason": self.unobservable_reason, "remark": self.remark}
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,8 +93,8 @@ def assemble(
 ) -> Identification:
     """Return the figures of a fit, and the airframe with those that the records tell."""
     before = models[0].signals.airframe
-    ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / before.motor_thrust_max
-    if not _PLAUSIBLE[0] <= ratio <= _PLAUSIBLE[1]:
+    ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / _full_thrust(before)
+    if not _PLAUSIBLE_RATIO[0] <= ratio <= _PLAUSIBLE_RATIO[1]:
         raise InputError(
             f"the motion does not follow the motors: thrust over mass {ratio:.2f} times that of {before.name}",
             hint="is the body that was tracked the vehicle, and upright? `cfplan replay` shows both",
@@ -102,22 +102,20 @@ def assemble(
     found = _dynamics(solution, before, mass) | _latencies(models, solution) | _geometry(models, solution)
     found["thrust per volt"] = _battery(models, solution, voltage)
 
-    def told(name: str, otherwise: float) -> float:
-        return otherwise if found[name].untold else found[name].value
+    def value_or(name: str, otherwise: float) -> float:
+        return otherwise if found[name].unobservable_reason else found[name].value
 
-    scale = found["thrust scale"].value
     airframe = replace(
         before,
         name=f"{before.name.removesuffix(', identified')}, identified",
         mass=found["mass"].value,
-        motor_thrust_min=before.motor_thrust_min * scale,
-        motor_thrust_max=before.motor_thrust_max * scale,
-        motor_time_constant=told("motor lag", before.motor_time_constant),
-        drag=(max(told("drag", before.drag[0]), 0.0), max(told("axial drag", before.drag[1]), 0.0)),
+        thrust_scale=found["thrust scale"].value,
+        motor_time_constant=value_or("motor lag", before.motor_time_constant),
+        drag=(max(value_or("drag", before.drag[0]), 0.0), max(value_or("axial drag", before.drag[1]), 0.0)),
         source=_SOURCE + before.source.removeprefix(_SOURCE),
     )
     notes, latency = _notes(mass, before, solution.rms), found["pose latency"]
-    misdated = abs(latency.value - latency.before) > _BEYOND_DOUBT * latency.deviation
+    misdated = abs(latency.value - latency.before) > _SIGNIFICANT_DEVIATIONS * latency.deviation
     return Identification(airframe, latency.value, misdated, found, notes, solution.rms)
 
 
@@ -125,43 +123,50 @@ def _dynamics(solution: FittedUnknowns, before: Airframe, mass: float | None) ->
     linear, covariance = solution.linear, solution.covariance
     thrust = float(np.linalg.norm(linear[THRUST]))
     direction = linear[THRUST] / thrust
-    doubt = math.sqrt(direction @ covariance[THRUST, THRUST] @ direction) / thrust
-    doubt = math.hypot(doubt, _UNSEEN_THRUST / (before.mass * GRAVITY))
+    std = math.sqrt(direction @ covariance[THRUST, THRUST] @ direction) / thrust
+    std = math.hypot(std, _THRUST_STD / (before.mass * GRAVITY))
     weight = before.mass if mass is None else mass
-    ratio = thrust / (before.motor_thrust_max / before.mass)
+    ratio = thrust / (_full_thrust(before) / before.mass)
     scale = thrust * weight / before.motor_thrust_max
-    held = "held: flying tells only thrust over mass; weigh it and give --mass" if mass is None else ""
-    lag, lag_doubt = solution.lag, math.sqrt(covariance[LINEAR, LINEAR])
+    held = "held: flights determine only thrust over mass; weigh the vehicle and give --mass" if mass is None else ""
+    lag, lag_std = solution.lag, math.sqrt(covariance[LINEAR, LINEAR])
     drags = {}
     for name, place, old in (("drag", DRAG, before.drag[0]), ("axial drag", AXIAL_DRAG, before.drag[1])):
-        value, doubt_of_drag = weight * linear[place], weight * math.sqrt(covariance[place, place])
-        vague = doubt_of_drag > _TELLS_DRAG * max(abs(value), 0.2 * old) or value < 0.0
-        why = "too vague, kept as before: fly faster, or longer" if vague else ""
-        drags[name] = IdentifiedQuantity(name, float(value), doubt_of_drag, "mN s/m", old, 2, why, scale=1e3)
-    vague = "too vague, kept as before: climb and sink more sharply" if lag_doubt > _TELLS_LAG else ""
+        value, drag_std = weight * linear[place], weight * math.sqrt(covariance[place, place])
+        too_uncertain = drag_std > _MAX_DRAG_STD * max(abs(value), 0.2 * old) or value < 0.0
+        why = "too uncertain, kept as before: fly faster, or longer" if too_uncertain else ""
+        drags[name] = IdentifiedQuantity(name, float(value), drag_std, "mN s/m", old, 2, why, scale=1e3)
+    too_uncertain = "too uncertain, kept as before: climb and sink more sharply" if lag_std > _MAX_LAG_STD else ""
     remark = "with the mass as it is" if held else ""
     return {
-        "thrust over mass": IdentifiedQuantity("thrust over mass, relative", ratio, ratio * doubt, "", 1.0, 4),
+        "thrust over mass": IdentifiedQuantity("thrust over mass, relative", ratio, ratio * std, "", 1.0, 4),
         "mass": IdentifiedQuantity("mass", weight, math.nan, "g", before.mass, 2, held, scale=1e3),
-        "thrust scale": IdentifiedQuantity("thrust scale", scale, scale * doubt, "", 1.0, 4, remark=remark),
+        "thrust scale": IdentifiedQuantity(
+            "thrust scale", scale, scale * std, "", before.thrust_scale, 4, remark=remark
+        ),
         "motor lag": IdentifiedQuantity(
-            "motor lag", lag, lag_doubt, "ms", before.motor_time_constant, 1, vague, scale=1e3
+            "motor lag", lag, lag_std, "ms", before.motor_time_constant, 1, too_uncertain, scale=1e3
         ),
         **drags,
     }
 
 
+def _full_thrust(airframe: Airframe) -> float:
+    """Return the thrust of one motor, N, at the full command."""
+    return airframe.motor_thrust_max * airframe.thrust_scale
+
+
 def _latencies(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
     variances = np.diag(solution.covariance)[LINEAR + 1 :].reshape(-1, 3)
     behind = np.array([model.signals.behind for model in models])
-    pose, pose_doubt = _mean(behind + solution.times[:, 0] + _LOG_DELAY, variances[:, 0])
-    link, link_doubt = _mean(solution.times[:, 1], variances[:, 1])
+    pose, pose_std = _mean(behind + solution.times[:, 0] + _LOG_DELAY, variances[:, 0])
+    link, link_std = _mean(solution.times[:, 1], variances[:, 1])
     return {
         "pose latency": IdentifiedQuantity(
-            "pose latency", pose, math.hypot(pose_doubt, _LOG_DOUBT), "ms", float(behind.mean()), 1, scale=1e3
+            "pose latency", pose, math.hypot(pose_std, _LOG_DELAY_STD), "ms", float(behind.mean()), 1, scale=1e3
         ),
         "link latency": IdentifiedQuantity(
-            "link latency, to the vehicle", link, link_doubt, "ms", math.nan, 1, scale=1e3
+            "link latency, to the vehicle", link, link_std, "ms", math.nan, 1, scale=1e3
         ),
     }
 
@@ -169,37 +174,37 @@ def _latencies(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[
 def _geometry(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[str, IdentifiedQuantity]:
     """Return how the markers' body is turned and where its origin is, and where the centre of mass is."""
     mountings = np.array([model.attitude.mounting for model in models])
-    doubts = np.array([model.attitude.mounting_deviation for model in models])
-    yaw, yaw_doubt = _mean(mountings[:, 2], doubts[:, 2] ** 2)
+    stds = np.array([model.attitude.mounting_deviation for model in models])
+    yaw, yaw_std = _mean(mountings[:, 2], stds[:, 2] ** 2)
     thrust = solution.linear[THRUST]
     size = float(np.linalg.norm(thrust))
     # The thrust axis in the markers' axes, turned about z into the vehicle's: n ≈ (−pitch, roll, 1).
     direction = Rotation.from_rotvec([0.0, 0.0, yaw]).apply(thrust / size)
-    tilt_doubt = np.sqrt(np.diag(solution.covariance)[THRUST]) / size
+    tilt_std = np.sqrt(np.diag(solution.covariance)[THRUST]) / size
     found = {}
-    for name, value, doubt in (
-        ("roll", direction[1], float(tilt_doubt[1])),
-        ("pitch", -direction[0], float(tilt_doubt[0])),
-        ("yaw", yaw, yaw_doubt),
+    for name, value, std in (
+        ("roll", direction[1], float(tilt_std[1])),
+        ("pitch", -direction[0], float(tilt_std[0])),
+        ("yaw", yaw, yaw_std),
     ):
         found[f"mounting {name}"] = IdentifiedQuantity(
-            f"markers turned, {name}", float(value), doubt, "°", 0.0, 2, scale=math.degrees(1.0)
+            f"markers turned, {name}", float(value), std, "°", 0.0, 2, scale=math.degrees(1.0)
         )
     for axis, place in zip("xyz", range(ORIGIN.start, ORIGIN.stop), strict=True):
-        doubt = math.sqrt(solution.covariance[place, place])
+        std = math.sqrt(solution.covariance[place, place])
         found[f"origin {axis}"] = IdentifiedQuantity(
             f"markers' origin, {axis} from centre of mass",
             float(solution.linear[place]),
-            doubt,
+            std,
             "mm",
             0.0,
             1,
             scale=1e3,
         )
     centre, spread = _centre_of_mass([model.signals for model in models])
-    for axis, value, doubt in zip("xy", centre, spread, strict=True):
+    for axis, value, std in zip("xy", centre, spread, strict=True):
         found[f"centre of mass {axis}"] = IdentifiedQuantity(
-            f"centre of mass, {axis} from the motors' middle", float(value), float(doubt), "mm", 0.0, 2,
+            f"centre of mass, {axis} from the motors' middle", float(value), float(std), "mm", 0.0, 2,
             remark="or motors that differ as much", scale=1e3,
         )  # fmt: skip
     return found
@@ -224,17 +229,24 @@ def _centre_of_mass(flights: Sequence[FlightSignals]) -> tuple[NDArray, NDArray]
 def _battery(models: Sequence[FlightModel], solution: FittedUnknowns, voltage: float) -> IdentifiedQuantity:
     nominal = float(np.linalg.norm(solution.linear[THRUST]))
     value = float(solution.linear[BATTERY]) / nominal
-    doubt = math.sqrt(solution.covariance[BATTERY, BATTERY]) / nominal
+    std = math.sqrt(solution.covariance[BATTERY, BATTERY]) / nominal
     volts = np.concatenate([slow_voltage(model.signals) for model in models])
     span = float(np.ptp(volts))
-    untold = f"the voltage spanned {span:.2f} V: fly full and nearly empty" if span < _TELLS_BATTERY else ""
-    return IdentifiedQuantity(f"thrust per volt, at {voltage:.2f} V", value, doubt, "%/V", 0.0, 1, untold, scale=100.0)
+    unobservable_reason = (
+        f"the voltage spanned {span:.2f} V: fly full and nearly empty" if span < _MIN_VOLTAGE_SPAN else ""
+    )
+    return IdentifiedQuantity(
+        f"thrust per volt, at {voltage:.2f} V", value, std, "%/V", 0.0, 1, unobservable_reason, scale=100.0
+    )
 
 
 def _notes(mass: float | None, before: Airframe, misfit: float) -> tuple[str, ...]:
-    untold = "not told by these records: inertia, yaw torque per thrust, rotor reaction; as in the airframe before"
+    unobservable_reason = (
+        "not observable in these records: inertia, moment by velocity, yaw torque per thrust, rotor reaction, lift "
+        "with speed, curvature of thrust; as in the airframe before"
+    )
     large = f"{1e3 * misfit:.1f} mm rms of motion are not explained: wind, a changed load or poses of bad quality?"
-    always = (untold, large) if misfit > _LARGE_MISFIT else (untold,)
+    always = (unobservable_reason, large) if misfit > _LARGE_MISFIT else (unobservable_reason,)
     if mass is not None:
         return (f"mass {1e3 * mass:.2f} g as given; thrust and drag follow from it", *always)
     return (

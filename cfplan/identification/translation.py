@@ -2,13 +2,13 @@
 
 In the axes of the markers' body, R from them to the world, F the collective command after the motors' lag:
 
-    p̈ = R (κ F − D Rᵀ ṗ) − g e₃          seen at p + R r, δ late
+    p̈ = R (κ F L − D Rᵀ ṗ) − g e₃          seen at p + R r, δ late
 
-κ (3,) is the thrust of the full command over the mass, along the thrust axis; D = diag(d, d, d_z) the drag over the
-mass; r the markers' origin. Integrated twice over windows whose position and velocity at the start are free, this is
-linear in κ, d, d_z, r and in the change of κ with the battery's voltage; the motors' lag, δ and the two moments of the
-command's stairs are not linear. Masses, thrusts, drag and inertia scaled by one factor move alike: no record of motion
-tells that factor.
+L is the airframe's lift with speed; κ (3,) is the thrust of the full command over the mass, along the thrust axis; D =
+diag(d, d, d_z) the drag over the mass; r the markers' origin. Integrated twice over windows whose position and velocity
+at the start are free, this is linear in κ, d, d_z, r and in the change of κ with the battery's voltage; the motors'
+lag, δ and the two moments of the command's stairs are not linear. Masses, thrusts, drag and inertia scaled by one
+factor move alike: no record of motion tells that factor.
 """
 
 from dataclasses import dataclass, field
@@ -52,9 +52,9 @@ class FlightModel:
         """
         grid, signals = grid_of(self.signals), self.signals
         time = signals.pose_time - shift
-        thrust = lagged(self._command(delay, phase), lag)
-        velocity = self._velocity(grid, time)
-        along = np.einsum("nji,nj->ni", self.turn, velocity)
+        along = np.einsum("nji,nj->ni", self.turn, self._velocity(grid, time))
+        lift = signals.airframe.lift_with_speed * (along[:, :2] ** 2).sum(axis=1)
+        thrust = lagged(self._command(delay, phase), lag) * (1.0 + lift)
         axial = along * [0.0, 0.0, 1.0]
         accelerations = [self.turn[:, :, axis] * thrust[:, None] for axis in range(3)]
         accelerations += [-np.einsum("nij,nj->ni", self.turn, part) for part in (along - axial, axial)]

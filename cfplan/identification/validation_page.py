@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from cfplan.files.whole import check_new_file, write_whole
+from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.identification.validate import Comparison, Validation
 from cfplan.recording.plots import FLOWN, WANTED
 from cfplan.recording.report.charts import Curve, time_chart
@@ -85,7 +85,7 @@ def write_validation_page(validations: Sequence[Validation], file: Path, *, over
     check_new_file(file, overwrite=overwrite)
     title = validations[0].log.name if len(validations) == 1 else f"{len(validations)} flights"
     body = f"<h1>{html.escape(title)}: predicted against measured</h1>" + "".join(map(_section, validations))
-    write_whole(file, html_page(f"{title}: validation", body, __version__).encode())
+    write_atomically(file, html_page(f"{title}: validation", body, __version__).encode())
 
 
 def _section(validation: Validation) -> str:

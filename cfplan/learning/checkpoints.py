@@ -11,7 +11,7 @@ import torch
 from torch import nn, optim
 
 from cfplan.errors import InputError
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 
 CHECKPOINT, LOG = "checkpoint.pt", "log.csv"
 
@@ -48,7 +48,7 @@ def save_checkpoint(
     writer.writerows(asdict(epoch) for epoch in log)
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in ((CHECKPOINT, buffer.getvalue()), (LOG, table.getvalue().encode())):
-        with whole(folder / name) as unfinished:
+        with atomic_write(folder / name) as unfinished:
             unfinished.write_bytes(data)
 
 

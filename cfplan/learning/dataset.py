@@ -17,7 +17,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cfplan.errors import InputError
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 from cfplan.learning.dataset_spec import SPEC_FILE, DatasetSpec, load_spec, require_same
 from cfplan.learning.labels import SCHEMA, TIMING_SCHEMA, ChoosePath, make_rows
 from cfplan.learning.workers import pool
@@ -58,7 +58,7 @@ def make_dataset(
         for number, rows, timing in work(partial(label_shard, spec, choose=choose), missing):
             try:
                 for part, content in ((TIMING, timing), (SHARDS, rows)):
-                    with whole(_shard(folder, part, number)) as unfinished:
+                    with atomic_write(_shard(folder, part, number)) as unfinished:
                         unfinished.write_bytes(content)
             except OSError as error:
                 raise InputError(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cfplan import __version__
 from cfplan.errors import InputError
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 from cfplan.geometry.path_families import USUAL, Family
 from cfplan.geometry.path_file import PathShape
 from cfplan.geometry.yaw import YawMode
@@ -111,7 +111,7 @@ class DatasetSpec:
 
     def save(self, folder: Path) -> None:
         """Write dataset.json, whole or not at all."""
-        with whole(folder / SPEC_FILE) as unfinished:
+        with atomic_write(folder / SPEC_FILE) as unfinished:
             unfinished.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
 

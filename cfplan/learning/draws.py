@@ -88,9 +88,8 @@ def draw_limits(random: np.random.Generator, airframe: Airframe) -> PlanLimits:
 
 def edit_limits(random: np.random.Generator, known: LimitSet, airframe: Airframe) -> PlanLimits:
     """Change the limits of a known set at random, for a vehicle."""
-    reserve = (known.airframe.motor_thrust_max - known.limits.motor_thrust_max) / (
-        known.airframe.motor_thrust_max - known.airframe.motor_thrust_min
-    )
+    least, most = known.airframe.thrust_range
+    reserve = (most - known.limits.motor_thrust_max) / (most - least)
     changed = {
         name: getattr(known.limits, name) * math.exp(random.normal(scale=EDIT))
         for name in ("speed", "acceleration", "angular_velocity", "angular_acceleration", "tilt")
@@ -109,7 +108,7 @@ def draw_space(random: np.random.Generator, waypoints: NDArray) -> Space:
 
 def _room(airframe: Airframe) -> float:
     """Return the largest reserve that leaves hovering room."""
-    hover, least, most = airframe.hover_thrust, airframe.motor_thrust_min, airframe.motor_thrust_max
+    hover, (least, most) = airframe.hover_thrust, airframe.thrust_range
     return min(hover * (1 - HOVER_ROOM) - least, most - hover * (1 + HOVER_ROOM)) / (most - least)
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
+from cfplan.files.atomic import atomic_write
 from cfplan.files.shipped import shipped_folder
-from cfplan.files.whole import whole
 from cfplan.learning import features
 from cfplan.learning.features import LOGARITHMS, NUMBERS, ScaledLimits, scaled_limits
 from cfplan.learning.inference import NETWORKS, Network, tensor_shapes
@@ -96,7 +96,7 @@ def save_model(folder: Path, card: Card, weights: Mapping[str, NDArray]) -> Card
     text = asdict(card) | {"weights_sha256": hashlib.sha256(content).hexdigest()}
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in ((WEIGHTS, content), (CARD, (json.dumps(text, indent=2, ensure_ascii=False) + "\n").encode())):
-        with whole(folder / name) as unfinished:
+        with atomic_write(folder / name) as unfinished:
             unfinished.write_bytes(data)
     return _card(text)
 

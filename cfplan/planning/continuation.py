@@ -105,7 +105,7 @@ def continue_plan(
     away = float(np.linalg.norm(points[0] - departure.position))
     rest = trajectory.at(min(leave + STOPPING, trajectory.duration)).position
     raise NoWayError(
-        f"from {moving:.2f} m/s no way leads through waypoint 1, {away:.2f} m away: {made}",
+        f"from {moving:.2f} m/s no path leads through waypoint 1, {away:.2f} m away: {made}",
         where="waypoint 1",
         hint=f"give a waypoint farther on than {coordinates(rest, '.2f')} m, where it could rest, or stop first",
     )
@@ -136,7 +136,9 @@ def plan_from_rest(
             speed_factor=min(speed / limits.plan.speed, 1.0),
         )  # fmt: skip
         return Continuation(planned, tuple(found.breaks[found.waypoint[1:]].tolist()))
-    raise NoWayError(f"no way leads from rest through the waypoints: {made}", where="waypoint 1", hint=_OTHER_WAYPOINTS)
+    raise NoWayError(
+        f"no path leads from rest through the waypoints: {made}", where="waypoint 1", hint=_OTHER_WAYPOINTS
+    )
 
 
 def check_waypoints(points: NDArray, limits: Limits) -> None:

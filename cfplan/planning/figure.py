@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.files.whole import check_new_file, write_whole
+from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.geometry.path import Path as CurvePath
 from cfplan.geometry.path_file import PathFile
 from cfplan.geometry.waypoints import Gate, Within
@@ -102,7 +102,7 @@ def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> Non
     check_figure_file(file, overwrite=overwrite)
     content = BytesIO()
     figure.savefig(content, format=file.suffix[1:], dpi=150)
-    write_whole(file, content.getvalue())
+    write_atomically(file, content.getvalue())
 
 
 def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None, across: int, up: int) -> None:
@@ -183,8 +183,8 @@ def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: 
     inset.set(xlim=centre[0] + np.array([-half, half]), ylim=centre[1] + np.array([-half, half]), aspect="equal")
     if axes.xaxis_inverted():
         inset.invert_xaxis()
-    for height, told in ((0.87, f"{100 * flown.deviation[worst]:.1f} cm off"), (0.04, "○ planned  ● flown")):
-        inset.text(0.5, height, told, transform=inset.transAxes, ha="center", fontsize=6)
+    for height, label in ((0.87, f"{100 * flown.deviation[worst]:.1f} cm off"), (0.04, "○ planned  ● flown")):
+        inset.text(0.5, height, label, transform=inset.transAxes, ha="center", fontsize=6)
     axes.indicate_inset_zoom(inset, edgecolor="0.3")
 
 

@@ -122,5 +122,5 @@ def check_endurance(duration: float, limits: Limits, which: str = "") -> None:
             f"the path takes {which}{duration:.1f} s, with take-off and landing up to {duration + around:.1f} s; the "
             f"battery is trusted for {limits.battery.endurance:g} s",
             where="battery.endurance",
-            hint="fly fewer laps, a shorter path, or a larger share of the speed",
+            hint="fly fewer laps, a shorter path, or fly at a higher --speed",
         )

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.files.whole import whole_file
+from cfplan.files.atomic import atomic_output
 from cfplan.geometry.path import Path
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.safety.certificate import certify
@@ -66,7 +66,7 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
     }
     table = pyarrow.table(columns)
     table = table.replace_schema_metadata({_KEY: json.dumps(metadata).encode()})
-    with whole_file(FilePath(file)) as unfinished:
+    with atomic_output(FilePath(file)) as unfinished:
         pyarrow.parquet.write_table(table, unfinished, compression="zstd")
 
 

@@ -30,7 +30,7 @@ from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
-NEARLY = 0.02  # by which a share of a limit may exceed 1 for slowing as a whole to be the end of it
+SLOWING_TOLERANCE = 0.02  # by which a share of a limit may exceed 1 for slowing as a whole to be the end of it
 NOTICEABLE = 0.01  # relative change of speed at a place, from which it is reported
 
 
@@ -87,7 +87,7 @@ def refine(task: PlanningTask, profile: SpeedProfile, space: Space | None = None
     """
     limits, caps, before = task.limits, task.speed_caps, duration_of(profile)
     refined = _refined(task, profile, space)
-    if refined.certificate and (refined.certificate.passed or _nearly_passes(refined.certificate)):
+    if refined.certificate and (refined.certificate.passed or _within_slowing_tolerance(refined.certificate)):
         slowed = slow_until_certified(refined.trajectory, limits, space, refined.certificate, caps, task.deadline)
         return _repaired(slowed, before, profile, refined)
     if task.dispensable and task.deadline.passed:
@@ -116,9 +116,9 @@ def _refined(task: PlanningTask, profile: SpeedProfile, space: Space | None) -> 
     return _Refined(trajectory, certificate, solution.reason, solution.joints)
 
 
-def _nearly_passes(certificate: Certificate) -> bool:
+def _within_slowing_tolerance(certificate: Certificate) -> bool:
     """Return whether slowing as a whole costs so little that nothing else need be tried."""
-    return certificate.worst.share < 1.0 + NEARLY
+    return certificate.worst.share < 1.0 + SLOWING_TOLERANCE
 
 
 def _lowered(

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.files.atomic import write_atomically
 from cfplan.files.text import read_table
-from cfplan.files.whole import write_whole
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
 from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
@@ -183,14 +183,14 @@ def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
     """Write polynomials, and read them again as their receiver does. Raises InputError, or NotCertifiedError."""
     pieces = exported.on_board.pieces
     if form is not Form.CRAZYSWARM:
-        write_whole(file, exported.on_board.memory)
+        write_atomically(file, exported.on_board.memory)
         return
-    write_whole(file, polynomial_rows(pieces.durations, pieces.coefficients).encode())
+    write_atomically(file, polynomial_rows(pieces.durations, pieces.coefficients).encode())
     read = Pieces(*read_polynomial_rows(file))
     if not (
         np.array_equal(read.durations, pieces.durations) and np.array_equal(read.coefficients, pieces.coefficients)
     ):
-        raise NotCertifiedError("what was written reads otherwise", where=str(file), hint="please report this")
+        raise NotCertifiedError("the written file reads back differently", where=str(file), hint="please report this")
 
 
 def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
@@ -207,7 +207,7 @@ def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
         )  # fmt: skip
     rows = sample_rows(trajectory, rate)
     lines = [",".join(f"{value:.{_DIGITS}f}" for value in row) for row in rows.tolist()]
-    write_whole(file, ("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
+    write_atomically(file, ("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
     read, _ = read_table(file, len(COLUMNS), ", ".join(COLUMNS))
     check_samples(read, trajectory, limits, str(file))
     return len(read)

@@ -67,6 +67,6 @@ def rehearse(plan: PlannedFlight, *, on_step: OnStep = ignore_steps) -> DryRun:
     """
     if not isinstance(plan, PlannedFlight):
         raise InputError(
-            f"{type(plan).__name__} is no plan", where="plan", hint="make it with cfplan.plan(path, limits)"
+            f"{type(plan).__name__} is not a plan", where="plan", hint="make it with cfplan.plan(path, limits)"
         )
     return prepare_flight.rehearse(plan, prepare_flight.encode_flight(plan, on_step), on_step)

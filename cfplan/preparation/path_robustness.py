@@ -88,7 +88,7 @@ def path_robustness(
     """
     if draws < 1 or not scales or not all(0.0 < scale < np.inf for scale in scales):
         raise InputError(
-            "draws must be at least 1 and scales above 0 m", where="robustness", hint="leave them out for the usual"
+            "draws must be at least 1 and scales above 0 m", where="robustness", hint="leave them out for the defaults"
         )
 
     path_file, _ = chosen_path(path_file, limits, models=models)

@@ -81,7 +81,9 @@ class PlannedFlight:
     def save(self, file: Path | str, provenance: Mapping[str, str] | None = None) -> None:
         """Write the plan as a Parquet file that `plan_flight` reads. Raises InputError where it cannot."""
         if Path(file).suffix != PLAN_SUFFIX:
-            raise InputError(f"a plan's file ends in {PLAN_SUFFIX}", where=str(file), hint=f"add {PLAN_SUFFIX}")
+            raise InputError(
+                f"the name of a plan file must end in {PLAN_SUFFIX}", where=str(file), hint=f"add {PLAN_SUFFIX}"
+            )
         save_plan(self.plan, file, {"name": self.name} | dict(provenance or {}))
 
     def plot(self) -> "Figure":

@@ -30,7 +30,7 @@ from cfplan.simulation.link_loss import link_loss_of_slow_motion
 
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
 _PLACES = 200  # on the way to the start, checked for obstacles
-_BESIDE = 0.3  # m, beyond the margin, between obstacles and a take-off that is simulated
+_TAKE_OFF_CLEARANCE = 0.3  # m, beyond the margin, between obstacles and a take-off that is simulated
 _BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
 _NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 _TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
@@ -63,7 +63,9 @@ def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_step
 def _motions(mission: Mission) -> Iterator[_Motion]:
     space, ground, height = mission.limits.space, mission.limits.ground, mission.take_off_height
     (x, y, z), yaw = mission.start
-    beside = replace(space, low=(-np.inf, -np.inf, space.low[2]), high=(np.inf,) * 3, margin=space.margin + _BESIDE)
+    beside = replace(
+        space, low=(-np.inf, -np.inf, space.low[2]), high=(np.inf,) * 3, margin=space.margin + _TAKE_OFF_CLEARANCE
+    )
     low, high = np.add(space.low, space.margin), np.subtract(space.high, space.margin)
     sides = [(low[0], y), (high[0], y), (x, low[1]), (x, high[1])]
     corners = list(product((low[0], high[0]), (low[1], high[1])))

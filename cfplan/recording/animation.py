@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
-from cfplan.files.whole import check_new_file, write_whole
+from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.planning.active_limits import FREE, active_limits
 from cfplan.planning.figure import FLOWN, OBSTACLE, caption, draw_path, draw_speed, limit_colour
 from cfplan.planning.plan_file import load_plan
@@ -81,7 +81,7 @@ def save_animation(frames: list[Image.Image], file: Path, *, overwrite: bool = F
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     content = BytesIO()
     few[0].save(content, "GIF", save_all=True, append_images=few[1:], duration=1000 // RATE, loop=0, optimize=True)
-    write_whole(file, content.getvalue())
+    write_atomically(file, content.getvalue())
 
 
 class _Scene:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import InputError
-from cfplan.files.json_values import json_value, whole_characters
+from cfplan.files.json_values import json_value, replace_surrogates
 from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.geometry.path_file import fingerprint
 from cfplan.safety.limits import Limits, PlanLimits
@@ -88,7 +88,7 @@ def header_under(
         uri=uri,
         planner=planner,
         vehicle=limits.airframe,
-        thrust_at_full_command=limits.airframe.motor_thrust_max,
+        thrust_at_full_command=limits.airframe.motor_thrust_max * limits.airframe.thrust_scale,
         plan_limits=limits.plan,
         bounds=bounds,
         travel_time=travel_time,
@@ -175,7 +175,7 @@ def header_from_json(text: str, *, where: str = "") -> RecordHeader:
     Records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
     """
     try:
-        values = whole_characters(json.loads(text))
+        values = replace_surrogates(json.loads(text))
         return RecordHeader(
             name=str(values["name"]),
             version=str(values["version"]),

@@ -23,7 +23,7 @@ NEARBY = 0.2  # s, around what the grid says, where time is looked for closely
 SPEED_SPAN = 0.025  # s, before and after
 _LONGEST_GAP = 0.1  # s between poses, over which a straight line still approximates where the vehicle was
 _SHORTEST_STEP = 1e-5  # s between poses, that anything measures
-_ALIKE = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
+_MAX_UNEXPLAINED = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +143,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
             hint="choose another subject with --subject, or leave out the plan",
         )
     guess, left_over = _on_grid(time, position, reference)
-    offset = _closely(guess, time, position, reference)
+    offset = _refined_time(guess, time, position, reference)
     difference = position - reference.at(time - offset)
     difference = difference[np.isfinite(difference[:, 0])]
     if len(difference) == 0:
@@ -160,7 +160,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
         aside=(x, y, z),
         max_deviation=float(distance.max()),
         rms_deviation=float(np.sqrt(np.mean(distance**2))),
-        alike=left_over <= _ALIKE,
+        alike=left_over <= _MAX_UNEXPLAINED,
     )
 
 
@@ -195,7 +195,7 @@ def _correlated(log: NDArray, plan: NDArray) -> NDArray:
     return oaconvolve(log, plan[::-1])
 
 
-def _closely(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:
+def _refined_time(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:
     """Return the offset near a guess at which the difference of log and plan varies least.
 
     The seen part of the plan changes with the offset, which draws the guess by a few steps: here that part is fixed.

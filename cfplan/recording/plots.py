@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cfplan.flight.telemetry import Phase
 from cfplan.recording.record import Record, meant_motion
-from cfplan.recording.summary import deviation, reference_span
+from cfplan.recording.summary import deviation, reference_span, reference_times
 from cfplan.vehicle.motor_commands import command_shares
 
 FAR_LIMIT = 2.0  # times the measured span beyond it, from which on a limit is not drawn
@@ -62,6 +62,7 @@ def plots(record: Record) -> tuple[Plot, ...]:
     setpoints, estimates, status = record.setpoints, record.estimates, record.status
     bounds, planned, motors = record.header.bounds, record.header.plan_limits, motor_thrust(record)
     _, meant_acceleration, meant_rate = meant_motion(setpoints)
+    wanted = reference_times(setpoints)
     off = deviation(record, *_along_the_path(record))
     aged, age = pose_age(record)
     return (
@@ -78,13 +79,13 @@ def plots(record: Record) -> tuple[Plot, ...]:
             (Line("motors", status.time, motors, ("motor 1", "motor 2", "motor 3", "motor 4"), FOUR),),
             (planned.motor_thrust_min, planned.motor_thrust_max),
         ),
-        _norms("speed", estimates.time, estimates.velocity, setpoints.due, setpoints.velocity, bounds.speed),
-        _norms("body_rate", status.time, status.body_rate, setpoints.due, meant_rate, bounds.body_rate),
+        _norms("speed", estimates.time, estimates.velocity, wanted, setpoints.velocity, bounds.speed),
+        _norms("body_rate", status.time, status.body_rate, wanted, meant_rate, bounds.body_rate),
         _norms(
             "acceleration",
             estimates.time,
             estimates.acceleration,
-            setpoints.due,
+            wanted,
             meant_acceleration,
             bounds.acceleration,
         ),

@@ -50,7 +50,7 @@ class PublicTopics:
         if not self._has_scene:
             self._has_scene = True
             self._send(SCENE, _scene(self._header), log_time, log_time)
-        for topic, content in _told(message):
+        for topic, content in _topics_of(message):
             self._send(topic, content, log_time, self._nanoseconds(message.time))
 
     def _send(self, topic: str, content: Any, log_time: int, time: int) -> None:
@@ -59,7 +59,7 @@ class PublicTopics:
         self._mcap.add_message(self._channels[topic], log_time, content.SerializeToString(), time)
 
 
-def _told(message: telemetry.Telemetry) -> Iterator[tuple[str, Any]]:
+def _topics_of(message: telemetry.Telemetry) -> Iterator[tuple[str, Any]]:
     """Return what a message tells by public schemas, without time stamps. What is not finite tells nothing."""
     match message:
         case telemetry.PoseReceived() | telemetry.SetpointSent():

@@ -18,7 +18,7 @@ from mcap.records import Channel, Chunk, Footer, Header, McapRecord, Metadata, S
 from mcap.stream_reader import get_chunk_data_stream
 
 from cfplan.errors import InputError
-from cfplan.files.json_values import whole_characters
+from cfplan.files.json_values import replace_surrogates
 from cfplan.recording.commitments import check_commitments
 from cfplan.recording.header import RecordHeader, header_from_json
 from cfplan.recording.plausible import check_places, check_times, check_values
@@ -63,7 +63,7 @@ def read_record(place: Path) -> Record:
     for entry in _entries(data, len(MAGIC), payloads):
         match entry:
             case Header(profile=profile) if profile != PROFILE:
-                raise _not_ours(file, f"its profile is {profile[:40]!r}")
+                raise _foreign_file(file, f"its profile is {profile[:40]!r}")
             case Metadata(name=name, metadata=values) if name == METADATA:
                 header = _header(values, file)
             case Channel(id=number, topic=name):
@@ -160,11 +160,11 @@ def _read(file: Path) -> bytes:
                 where=str(file),
                 hint="the flight ended before anything was recorded",
             )
-        raise _not_ours(file, "it is no MCAP file")
+        raise _foreign_file(file, "it is no MCAP file")
     return data
 
 
-def _not_ours(file: Path, reason: str) -> InputError:
+def _foreign_file(file: Path, reason: str) -> InputError:
     return InputError(
         f"not a record of cfplan: {reason}", where=str(file), hint=f"name a flight's folder or its {FLIGHT_FILE}"
     )
@@ -221,7 +221,7 @@ def _summary(folder: Path) -> Mapping[str, Any]:
     if not (folder / SUMMARY_FILE).is_file():
         return {}
     try:
-        summary = whole_characters(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
+        summary = replace_surrogates(json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError):
         return {}
     return summary if isinstance(summary, dict) else {}

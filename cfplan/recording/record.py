@@ -26,7 +26,7 @@ class Setpoints:
     """The setpoints as sent; see telemetry.SetpointSent."""
 
     time: NDArray  # (N,) s, when each was handed to the link
-    due: NDArray  # (N,) s, its deadline
+    due: NDArray  # (N,) s, its deadline; it is sent ahead of the plan, see summary.reference_times()
     index: NDArray  # (N,) int, row of the encoded flight
     position: NDArray  # (N, 3) m
     velocity: NDArray  # (N, 3) m/s

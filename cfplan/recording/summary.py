@@ -1,7 +1,8 @@
 """Summarise a record in numbers: travel time, deviation, peaks, lateness, dropouts, battery.
 
-The reference is the position of each setpoint at its reference time, straight between them. A pose is
-compared with the reference at the pose's own time (deviation in time) and with the nearest point of the path.
+The reference is the position of each setpoint at its reference time, straight between them: LEAD after its deadline,
+as setpoints are sent ahead of the plan. A pose is compared with the reference at the pose's own time (deviation in
+time) and with the nearest point of the path.
 """
 
 import math
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.flight.telemetry import Phase
 from cfplan.numbers import shown
 from cfplan.recording.commitments import committed_path, committed_time
@@ -99,15 +101,16 @@ def summarise(record: Record) -> FlightSummary:
 
 
 def reference_span(record: Record) -> tuple[float, float]:
-    """Return s from the first deadline of the phase `stream` over the planned time, at most until its last deadline.
+    """Return s from the first deadline of the phase `stream`, where the plan begins, to where it ends.
 
+    Of a plan not sent to its end that is LEAD after the last deadline, the time for which that setpoint was made.
     What is streamed longer is the hover after the end of the path. NaN where nothing was streamed.
     """
     due = _streamed(record)
     if len(due) == 0:
         return math.nan, math.nan
     begin = float(due[0])
-    return begin, min(begin + committed_time(record), float(due[-1]))
+    return begin, min(begin + committed_time(record), float(due[-1]) + LEAD)
 
 
 def _streamed(record: Record) -> NDArray:
@@ -123,10 +126,12 @@ def _streamed(record: Record) -> NDArray:
 
 
 def reference_times(setpoints: Setpoints) -> NDArray:
-    """Return (N,) s, when the vehicle should have been at each setpoint.
+    """Return (N,) s, when the plan has the vehicle at each setpoint: LEAD after the deadline that it was made for."""
+    return _deadlines(setpoints) + LEAD
 
-    That is its deadline, but for one sent so late that the pilot sent the state of a later deadline in its place.
-    """
+
+def _deadlines(setpoints: Setpoints) -> NDArray:
+    """Return (N,) s, the deadline that each setpoint was made for: a later one than its own where it was sent late."""
     if len(setpoints.due) < 2:
         return setpoints.due
     period = np.median(np.diff(setpoints.due))
@@ -138,7 +143,7 @@ def planned_positions(record: Record) -> NDArray:
     sent, shift, due = record.setpoints, record.header.shift, _streamed(record)
     if not (len(shift) and len(due) > 1):
         return sent.position
-    row = np.round((reference_times(sent) - due[0]) / np.median(np.diff(due)))
+    row = np.round((_deadlines(sent) - due[0]) / np.median(np.diff(due)))
     return np.asarray(sent.position - shift[np.clip(row, 0, len(shift) - 1).astype(int)])
 
 

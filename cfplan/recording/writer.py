@@ -19,7 +19,7 @@ from typing import IO, Any, Protocol, cast
 from mcap.writer import CompressionType, Writer
 
 from cfplan.errors import InputError
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.telemetry import Telemetry
 from cfplan.recording.header import RecordHeader, header_to_json
@@ -72,7 +72,7 @@ def new_record_folder(root: Path, name: str, *, now: datetime | None = None) -> 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
     """Write summary.json, whole or not at all. Raises OSError, or ValueError where a number is not finite."""
     text = json.dumps(dict(summary), indent=2, allow_nan=False)
-    with whole(folder / SUMMARY_FILE) as unfinished:
+    with atomic_write(folder / SUMMARY_FILE) as unfinished:
         unfinished.write_text(text + "\n", encoding="utf-8")
 
 

@@ -42,8 +42,11 @@ OF_PLACE = (WALLS, OBSTACLES)  # decided by the path alone, at any speed
 CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
 POSITION = MEASURES  # row of what is searched, behind the measures: m, and the two rows behind
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
-_MOST_ADDED = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
-_NEARER, _TIMES = 4, 2  # so many times as near, so often: past that the flight is so rough that it fails in any case
+MAX_ALLOWANCE = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
+REFINE_FACTOR, MAX_REFINEMENTS = (
+    4,
+    2,
+)  # so many times as near, so often: past that the flight is so rough that it fails in any case
 _SAME = 1e-12  # share of a path's length in s, nearer than which two places are one
 
 
@@ -143,10 +146,10 @@ def certify(
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     path, body, nodes = trajectory.path, compiled_body(trajectory.airframe), trajectory.timing.nodes
     values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
-    for _ in range(_TIMES):
+    for _ in range(MAX_REFINEMENTS):
         if not any(map(_overstated, bounds, values.tolist(), added.tolist())):
             break
-        segments = segments._replace(counts=_NEARER * (segments.counts - 1) + 1)
+        segments = segments._replace(counts=REFINE_FACTOR * (segments.counts - 1) + 1)
         values, added, places = _search(table, walls, BATCH, body, path.origins, path.coefficients, nodes, segments)
     when, where = trajectory.time_at(places).tolist(), trajectory.path(places).tolist()
     peaks = zip(bounds, values.tolist(), when, places.tolist(), where, strict=True)
@@ -191,7 +194,7 @@ def _overstated(bound: _Bound, peak: float, added: float) -> bool:
     """Return whether what was added to a peak is much beside the limit; False where that is not a number."""
     quantity, limit, unused = bound
     sampled, worst = (float(quantity.value(quantity.side * value)) for value in (peak - added, peak))
-    return abs(worst - sampled) > _MOST_ADDED * (abs(limit) or abs(unused))
+    return abs(worst - sampled) > MAX_ALLOWANCE * (abs(limit) or abs(unused))
 
 
 def _margin(bound: _Bound, peak: float, time: float, s: float, position: Sequence[float]) -> Margin:

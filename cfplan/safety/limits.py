@@ -27,11 +27,9 @@ class PlanLimits:
 
 def within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
     """Return limits of motor thrust that leave `reserve`, a share of the motors' range, to feedback at both ends."""
-    room = reserve * (airframe.motor_thrust_max - airframe.motor_thrust_min)
-    return {
-        "motor_thrust_min": airframe.motor_thrust_min + room,
-        "motor_thrust_max": airframe.motor_thrust_max - room,
-    }
+    least, most = airframe.thrust_range
+    room = reserve * (most - least)
+    return {"motor_thrust_min": least + room, "motor_thrust_max": most - room}
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ from cfplan.vehicle.airframes import load_airframe
 DEFAULTS = Path(__file__).with_name("defaults.yaml")  # a whole safety.yaml, with comments
 LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: what a setpoint's 16 bits of thousandths hold
 
-_LEAST_PLANNED = {
+_PLANNING_MINIMA = {
     "speed": 0.02,
     "acceleration": 0.05,
     "angular_velocity": 0.05,
@@ -351,7 +351,7 @@ def _check_limits(content: _SafetyFile, places: Places) -> None:
                 where=places.where(section, key),
                 hint=f"write degrees: {tilt:g} rad is {math.degrees(tilt):.3g}; to fly slower, use --speed",
             )
-    for key, least in _LEAST_PLANNED.items():
+    for key, least in _PLANNING_MINIMA.items():
         if getattr(content.plan, key) < least:
             raise InputError(
                 f"plan.{key} is {getattr(content.plan, key):g}, less than {least:g}: noise would hide motion that slow",
@@ -525,6 +525,6 @@ def _check_vehicle_can(limits: Limits, places: Places) -> None:
 
 def _quickest_turn(airframe: Airframe) -> float:
     """Return the largest angular acceleration, rad/s², of motors at the ends of their range."""
-    ends = product((airframe.motor_thrust_min, airframe.motor_thrust_max), repeat=4)
+    ends = product(airframe.thrust_range, repeat=4)
     turns = airframe.mixing[1:] @ np.array(list(ends)).T / np.array(airframe.inertia)[:, None]
     return float(np.linalg.norm(turns, axis=0).max())

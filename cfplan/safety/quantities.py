@@ -25,11 +25,11 @@ AT_MOST, AT_LEAST = 1, -1  # sides of a limit
 PACKET_ROUNDING = 1e-3  # m/s² and less, by which packets may round what they hold
 
 
-def _itself(value: Any) -> Any:
+def _identity(value: Any) -> Any:
     return value
 
 
-def _nothing(_: Airframe) -> float:
+def _zero(_: Airframe) -> float:
     return 0.0
 
 
@@ -44,10 +44,10 @@ class Quantity:
     side: int  # AT_MOST or AT_LEAST
     measure: int  # the first of its measures
     count: int = 1  # of measures, all of which keep the limit
-    value: Callable[[Any], Any] = _itself  # the quantity, of its measure
-    measured: Callable[[Any], Any] = _itself  # the measure, of its quantity
-    row: Callable[[Any], Any] = _itself  # what the optimiser bounds, of the measure
-    hover: Callable[[Airframe], float] = _nothing  # the quantity in hover
+    value: Callable[[Any], Any] = _identity  # the quantity, of its measure
+    measured: Callable[[Any], Any] = _identity  # the measure, of its quantity
+    row: Callable[[Any], Any] = _identity  # what the optimiser bounds, of the measure
+    hover: Callable[[Airframe], float] = _zero  # the quantity in hover
     remedy: str = "loosen that limit"  # where hovering breaks it
     jumps: bool = False
     """Whether it jumps between intervals, as h''' and ψ'' do; a boundary state or a setpoint alone does not tell it."""
@@ -121,7 +121,7 @@ QUANTITIES = (
     Quantity(
         "motor thrust, most", "N", "motor_thrust_max", "motor_reserve", AT_MOST, measures.MOTOR_THRUST, 4, jumps=True,
         remedy="choose a stronger vehicle or a smaller reserve",
-        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.motor_thrust_max,
+        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.thrust_range[1],
     ),
     Quantity(
         "motor thrust, least", "N", "motor_thrust_min", "motor_reserve", AT_LEAST, measures.MOTOR_THRUST, 4, jumps=True,
@@ -140,7 +140,7 @@ ON_LADDER = tuple(quantity for quantity in QUANTITIES if quantity.ladder)  # wha
 # The optimiser's rows, one a measure: bounds of each in units of its scale, and which of them jump.
 LOWER, UPPER = np.full(measures.MEASURES, -np.inf), np.full(measures.MEASURES, np.inf)
 JUMPS = np.zeros(measures.MEASURES, dtype=bool)
-_ROWS: list[Callable[[Any], Any]] = [_itself] * measures.MEASURES
+_ROWS: list[Callable[[Any], Any]] = [_identity] * measures.MEASURES
 for _quantity in QUANTITIES:
     JUMPS[_quantity.which] = _quantity.jumps
     _ROWS[_quantity.which] = [_quantity.row] * _quantity.count
@@ -173,7 +173,7 @@ def scaled(measured: NDArray, limits: PlanLimits) -> NDArray:
     offset, scale = scales(limits)
     rows = measured - offset[:, None]
     for quantity in QUANTITIES:
-        if quantity.row is not _itself:
+        if quantity.row is not _identity:
             rows[quantity.which] = quantity.row(measured[quantity.which]) - offset[quantity.which, None]
     rows /= scale[:, None]
     return rows

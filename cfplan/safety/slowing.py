@@ -77,7 +77,7 @@ def slow_until_certified(
             break
     if best is None:
         raise InfeasibleError(
-            f"{certificate.worst.name} exceeds its limit however slow the flight",
+            f"{certificate.worst.name} exceeds its limit at any speed",
             where=f"{coordinates(certificate.worst.position, '.2f')} m",
             hint="loosen that limit or change the path there",
         )

@@ -78,7 +78,7 @@ class DryRun(Rehearsal):
     settle_time: float  # s, from the end of the motion until it stays within SETTLED; inf when it never does
     saturation: float  # share of the time for which the motor that fares worst is at either end of its range
     real_time_factor: float  # simulated seconds a second, of all draws at once
-    knows_drag: bool  # whether the filter was told of rotor drag, as the oldest firmware that may fly can be
+    knows_drag: bool  # whether the filter models rotor drag, as that of the oldest permitted firmware may
     loop: ClosedLoop  # the whole flight
 
     def __repr__(self) -> str:
@@ -98,7 +98,7 @@ class DryRun(Rehearsal):
 
     def rows(self) -> list[tuple[str, str]]:
         """Return everything but the flights themselves, for people."""
-        drag = "told of rotor drag" if self.knows_drag else "not told of rotor drag, as before firmware 2026.04"
+        drag = "models rotor drag" if self.knows_drag else "without a model of rotor drag, as before firmware 2026.04"
         return [
             ("verdict", self.reason or "passed"),
             ("largest deviation, median", f"{100 * self.deviation_median:.1f} cm of {len(self.deviations)} draws"),
@@ -172,11 +172,11 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.
 
     After `lost`, s, neither setpoints nor poses are sent, and its supervisor levels it out and stops its motors.
     """
-    told, drawn = limits.airframe, draw.airframe
-    gains = gains_for(told)
+    planned, drawn = limits.airframe, draw.airframe
+    gains = gains_for(planned)
     # Hover has lasted too short for the controller's integral, of some 25 s, to take off what weight and thrust are
     # other than it was told.
-    sunk = GRAVITY * (drawn.mass / drawn.thrust_scale - told.mass) / gains.kp_z
+    sunk = GRAVITY * (drawn.mass * planned.thrust_scale / drawn.thrust_scale - planned.mass) / gains.kp_z
     start = hovering(drawn, flight.wanted_at(np.zeros(1))[0] - [0.0, 0.0, sunk], flight.yaw)
     steps = round(flight.duration / TIME_STEP) + 1
     arrivals = np.arange(draw.pose_phase, min(flight.duration + TIME_STEP, lost), 1.0 / limits.pose.rate)
@@ -184,7 +184,7 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.
     alone = flight.times[sent][-1] + RADIO if lost < math.inf else math.inf
     noise = np.random.default_rng(draw.seed).normal(size=(len(arrivals), 6))
     noise *= np.repeat([limits.pose.position_noise, limits.pose.attitude_noise], 3)
-    drag = told.drag[0] / told.mass if knows_drag(limits) else 0.0
+    drag = planned.drag[0] / planned.mass if knows_drag(limits) else 0.0
     poses = EstimatorInput(
         arrivals, draw.pose_age, draw.attitude_age, position_deviation=EXTERNAL_POSITION_STD,
         attitude_deviation=EXTERNAL_ATTITUDE_STD, drag=(drag, drag, 0.0), noise=noise,
@@ -195,7 +195,7 @@ def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.
         level_at=alone + Timeouts().level_out_at_latest,
         off_at=alone + Timeouts().motors_off_at_latest(limits.firmware.watchdog),
     )  # fmt: skip
-    commands = flown.asked * (FULL_COMMAND / told.motor_thrust_max)
+    commands = flown.asked * (FULL_COMMAND / planned.motor_thrust_max)
     return ClosedLoop(np.arange(steps) * TIME_STEP, flown.states, commands)
 
 

@@ -34,7 +34,7 @@ TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
 WITHOUT_POSES_EVERY = 5  # setpoints
 SAMPLED_EVERY = 10  # setpoints, where the vehicle is far from lost
-NEARLY = 0.6  # usage above which it is not far; in 26 flights to 3 m/s it rose by 0.15 at most between samples
+CRITICAL_USAGE = 0.6  # usage above which it is not far; in 26 flights to 3 m/s it rose by 0.15 at most between samples
 _NEAR_WORST = 0.03  # usage; around samples this close to the worst one every setpoint is simulated
 _STEP = 2  # ms, of the simulation from the gap on: steps of 4 ms underestimate saturation of the motors
 
@@ -89,7 +89,7 @@ def glitch_at_sampled_setpoints(
     moments = flight.moments(found, limits, rate)
     usage = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
     usage[moments.lost.any(axis=0)] = np.inf
-    more = wanted & ~first & ~(usage < min(NEARLY, usage.max() - _NEAR_WORST))
+    more = wanted & ~first & ~(usage < min(CRITICAL_USAGE, usage.max() - _NEAR_WORST))
     return flight.moments(np.fmax(found, _gaps(flight, more, limits, GAP)), limits, rate)
 
 

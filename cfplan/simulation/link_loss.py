@@ -128,7 +128,7 @@ def link_loss_near_walls(
     as ending ALLOWANCE farther out. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half
     the time.
     """
-    return _look_at_some(payloads, limits, rate, starts, within)
+    return _simulate_sample(payloads, limits, rate, starts, within)
 
 
 def link_loss_at_walls(
@@ -138,7 +138,7 @@ def link_loss_at_walls(
 
     Like link_loss_near_walls(), but if every setpoint ends inside, the worst moment is not found.
     """
-    return _look_at_some(payloads, limits, rate, starts, None)
+    return _simulate_sample(payloads, limits, rate, starts, None)
 
 
 def foreseen_link_loss(
@@ -158,7 +158,7 @@ def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RA
         return found
     rows, boxes = setpoint_rows(state), found.boxes
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, None))
-    _look_again(boxes, rows, snapshots, limits, ~(found.beyond < -_SLOW_ALLOWANCE))
+    _simulate_again(boxes, rows, snapshots, limits, ~(found.beyond < -_SLOW_ALLOWANCE))
     return _judge(found.time, state.position, boxes, limits, snapshots)
 
 
@@ -238,11 +238,11 @@ def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | 
     state, middle = decode(payloads), _middle(limits)
     rows, airframe = setpoint_rows(state), _airframes(limits)[middle : middle + 1]
     snapshots = _flown(rows, limits, airframe, rate, _begins(state, limits, starts)[middle : middle + 1])
-    boxes = _first_look(rows, snapshots[0], limits, every)
+    boxes = _simulate_coarsely(rows, snapshots[0], limits, every)
     return _judge(np.arange(len(rows)) / rate, state.position, boxes, limits, snapshots)
 
 
-def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
+def _simulate_coarsely(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -> NDArray:
     """Return boxes, (N, S, 2, 3), by one motor lag, coarse steps and one in `every` setpoints.
 
     `snapshots`, (N, 31), are those of that lag. A setpoint between two simulated ones gets the boxes of both.
@@ -255,28 +255,28 @@ def _first_look(rows: NDArray, snapshots: NDArray, limits: Limits, every: int) -
     return _united([boxes[np.where(some, after, after - 1)], boxes[after]])
 
 
-def _look_at_some(
+def _simulate_sample(
     payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, within: float | None
 ) -> LinkLossMoments:
     """Simulate closely the setpoints that may end `within` m of a wall, and the worst; None: that may end outside."""
     state = decode(payloads)
     rows, number = setpoint_rows(state), np.arange(len(payloads))
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
-    boxes = _first_look(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
+    boxes = _simulate_coarsely(rows, snapshots[_middle(limits)], limits, _FIRST_EVERY)
     most = limits.space.swept(boxes)[0] + ALLOWANCE
     near = ~(most < -(within or 0.0))
     if within is not None:
         near |= number == most.argmax()
-    _look_again(boxes, rows, snapshots, limits, near)
+    _simulate_again(boxes, rows, snapshots, limits, near)
     found = _judge(number / rate, state.position, boxes, limits, snapshots)
     others = ~near & (most > found.beyond[near].max(initial=-np.inf))
     if within is not None and others.any():  # these may be worse
-        _look_again(boxes, rows, snapshots, limits, others)
+        _simulate_again(boxes, rows, snapshots, limits, others)
         found, near = _judge(number / rate, state.position, boxes, limits, snapshots), near | others
     return replace(found, beyond=np.where(near, found.beyond, most))
 
 
-def _look_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
+def _simulate_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
     """Replace `some`, (N,) bool, of the boxes, (N, S, 2, 3), of a first look; `snapshots` are (L, N, 31)."""
     boxes[some] = _swept(_Forks(rows, np.flatnonzero(some), snapshots[:, some], _airframes(limits)), limits)
 
@@ -309,7 +309,7 @@ def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
     """Fly on with the last setpoints; the accelerometer reads `error`, m/s², too little."""
     off, step = Timeouts().motors_off_at_latest(limits.firmware.watchdog), forks.step
     level, off = (step * round(1000 * each / step) for each in (LEVEL_AFTER, off))
-    return _leave(forks, limits, error, _alone(forks, limits)._replace(
+    return _lose_link(forks, limits, error, _without_setpoints(forks, limits)._replace(
         level_after=level, off_after=off, spread=_drift(limits, off, step)
     ))  # fmt: skip
 
@@ -319,10 +319,10 @@ def _fall(forks: _Forks, limits: Limits) -> NDArray:
     airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
     snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
     forks = forks._replace(snapshots=snapshots, airframes=airframes)
-    return _leave(forks, limits, 0.0, _alone(forks, limits)._replace(off_after=0))
+    return _lose_link(forks, limits, 0.0, _without_setpoints(forks, limits)._replace(off_after=0))
 
 
-def _alone(forks: _Forks, limits: Limits) -> Schedule:
+def _without_setpoints(forks: _Forks, limits: Limits) -> Schedule:
     arrivals, gains = np.zeros(len(forks.setpoints), dtype=np.int64), gains_for(limits.airframe).pack()
     step = forks.step
     return Schedule(
@@ -330,7 +330,7 @@ def _alone(forks: _Forks, limits: Limits) -> Schedule:
     )  # fmt: skip
 
 
-def _leave(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
+def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) -> NDArray:
     """Return the boxes, (F, S, 2, 3) m, of all airframes together."""
     lags, count = len(forks.airframes), len(forks.rows)
     last = np.tile(forks.rows, lags)

@@ -148,21 +148,21 @@ def identified_body(airframe: Airframe) -> BodyStep:
     def step(state: NDArray, asked: NDArray, seconds: float) -> NDArray:
         command = speed_of(np.clip(asked, 0.0, airframe.motor_thrust_max))
         count = int(np.ceil(seconds / _MOST_STEP - 1e-9))
-        theirs = _theirs(state, speed_of(state[MOTORS]))
+        theirs = _to_rotorpy(state, speed_of(state[MOTORS]))
         for _ in range(count):
             theirs = _runge_kutta(lambda x: derivative(x, command), theirs, seconds / count)
             theirs[3:7] /= np.linalg.norm(theirs[3:7])
-        return _ours(theirs, offset + slope * theirs[13:] + bend * theirs[13:] ** 2)
+        return _from_rotorpy(theirs, offset + slope * theirs[13:] + bend * theirs[13:] ** 2)
 
     return step
 
 
-def _theirs(state: NDArray, speeds: NDArray) -> NDArray:
+def _to_rotorpy(state: NDArray, speeds: NDArray) -> NDArray:
     """Return position, quaternion, velocity, body rate and rotor speeds, as drone-models orders them, (17,)."""
     return np.concatenate([state[POSITION], state[QUATERNION], state[VELOCITY], state[BODY_RATE], speeds])
 
 
-def _ours(theirs: NDArray, thrust: NDArray) -> NDArray:
+def _from_rotorpy(theirs: NDArray, thrust: NDArray) -> NDArray:
     state = np.empty(STATE_SIZE)
     state[POSITION], state[QUATERNION], state[VELOCITY] = theirs[:3], theirs[3:7], theirs[7:10]
     state[BODY_RATE], state[MOTORS] = theirs[10:13], thrust

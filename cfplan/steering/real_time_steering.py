@@ -127,8 +127,8 @@ class RealTimeSteering:
             gone = not planner.alive
             with self._change:
                 if gone:
-                    told = {answer.number for answer in answers}
-                    left = sorted(self._unanswered - told)
+                    answered = {answer.number for answer in answers}
+                    left = sorted(self._unanswered - answered)
                     answers += [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in left]
                 for answer in answers:
                     self._unanswered.discard(answer.number)

@@ -88,8 +88,8 @@ def recertify(record: Record) -> Recertified:
         if plan is not None:
             jump = max(jump, _jump(timeline.for_plans_from(splice, limits), joint_of(splice), plan))
             limits = plan.limits
-        told, checksum = commitments.payloads[number], int(commitments.checksum[number])
-        made = _committed(timeline, splice, plan, limits, told, checksum=checksum, number=number)
+        committed, checksum = commitments.payloads[number], int(commitments.checksum[number])
+        made = _committed(timeline, splice, plan, limits, committed, checksum=checksum, number=number)
         begins = int(commitments.splice[number:].min())  # no other plan leaves before that setpoint
         timeline = made.accepted(spliced(timeline.commitment, made.proposal, begins))
         stops += timeline.stopping
@@ -150,22 +150,22 @@ def _committed(
     Raises NotCertifiedError where it is something else.
     """
     where = f"plan {number}, from setpoint {splice} on"
-    told = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
+    committed = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
     timeline = timeline.for_plans_from(splice, limits)
     motion = timeline.motion
     if plan is not None:
         motion = motion.continued(joint_of(splice), plan.trajectory)
     onward = timeline.onward(splice, motion)
-    if plan is None and (timeline.part_ends is None or not _goes_on(onward, told, limits)):
-        return _stopped(timeline, splice, told, checksum, where, limits)
+    if plan is None and (timeline.part_ends is None or not _goes_on(onward, committed, limits)):
+        return _stopped(timeline, splice, committed, checksum, where, limits)
     try:
-        if len(told) == len(onward.encoded(limits).payloads):
+        if len(committed) == len(onward.encoded(limits).payloads):
             made = certify_whole(onward, limits)
         else:
-            made = certify_beginning(onward, len(told) - STOP_AND_HOVER, limits, foresee=False)
+            made = certify_beginning(onward, len(committed) - STOP_AND_HOVER, limits, foresee=False)
     except CfplanError as error:
         raise NotCertifiedError(f"{error.where}: {error.what}", where=where, hint=error.hint) from error
-    if told.shape != made.payloads.shape or (told != made.payloads).any():
+    if committed.shape != made.payloads.shape or (committed != made.payloads).any():
         raise NotCertifiedError("the setpoints are not those of the plan", where=where, hint="was the record changed?")
     proposal = propose(timeline.commitment, splice, made.payloads, made.stops, made.ending)
     if proposal.checksum != checksum:
@@ -174,24 +174,26 @@ def _committed(
     return Replanned(proposal, later, plan, joint_of(splice))
 
 
-def _goes_on(onward: Onward, told: NDArray, limits: Limits) -> bool:
+def _goes_on(onward: Onward, committed: NDArray, limits: Limits) -> bool:
     """Return whether setpoints are more of the plan that is flown, and no stop."""
     payloads = onward.encoded(limits).payloads
-    following = len(told) - STOP_AND_HOVER
+    following = len(committed) - STOP_AND_HOVER
     if following < 2:  # a stop is as long, and begins like the plan; what is left of a plan is all of it
-        return np.array_equal(told, payloads)
-    return np.array_equal(told[:following], payloads[:following])
+        return np.array_equal(committed, payloads)
+    return np.array_equal(committed[:following], payloads[:following])
 
 
-def _stopped(timeline: Timeline, splice: int, told: NDArray, checksum: int, where: str, limits: Limits) -> Replanned:
+def _stopped(
+    timeline: Timeline, splice: int, committed: NDArray, checksum: int, where: str, limits: Limits
+) -> Replanned:
     """Return a requested stop, certified again. Raises InputError if there is none."""
     for duration in STOPS:
         with suppress(CfplanError):
             made = stop_within(timeline, splice, duration, limits)
-            if made.proposal.checksum == checksum and np.array_equal(made.proposal.payloads, told):
+            if made.proposal.checksum == checksum and np.array_equal(made.proposal.payloads, committed):
                 return made
     raise InputError(
-        "there is no such file with its plan, and it is no certified stop either",
+        "there is no such file with its plan, and it is not a certified stop",
         where=where,
         hint="copy the whole folder of the record; else it was changed since",
     )
@@ -220,6 +222,6 @@ def _compare(record: Record, sequence: NDArray) -> tuple[int, float | None]:
             raise NotCertifiedError(
                 f"its {name.replace('_', ' ')} is off by {off.max():.4f} from what was committed",
                 where=f"setpoint {sent.index[at]} as streamed",
-                hint="the pilot sent what it was not bound to, or the record was changed since",
+                hint="the pilot sent something else, or the record was changed since",
             )
     return len(rows), float(left - began[0]) if np.isfinite(left) and left <= end else None

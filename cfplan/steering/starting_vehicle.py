@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SIMULATED = "sim://"
 VIRTUAL_SUBJECT = "cf1"  # the only body that it sees
 VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
-_OPENS_WITHIN = 10.0  # s for its first poses: it is there, but this computer may be busy
+_OPEN_TIMEOUT = 10.0  # s for its first poses: it is there, but this computer may be busy
 
 
 def check_uris(uri: str, mocap_uri: str | None) -> None:
@@ -33,7 +33,7 @@ def check_uris(uri: str, mocap_uri: str | None) -> None:
             raise InputError("the lab has a virtual Vicon only", where=mocap_uri, hint="use vicon:// or vicon-sdk://")
         if mocap.host == VIRTUAL_VICON and uri.startswith(SIMULATED) and mocap.subject != VIRTUAL_SUBJECT:
             raise InputError(
-                f"the virtual Vicon sees {VIRTUAL_SUBJECT!r} alone, not {mocap.subject!r}",
+                f"the virtual Vicon sees only {VIRTUAL_SUBJECT!r}, not {mocap.subject!r}",
                 where=mocap_uri,
                 hint=f"use {mocap.system}://{VIRTUAL_VICON}/{VIRTUAL_SUBJECT}",
             )
@@ -111,7 +111,7 @@ class StartingVehicle:
                 results.append(f"the virtual Crazyflie is at {lab.uri}")
             if mocap.host == VIRTUAL_VICON:
                 uri = lab.mocap_uri.replace("vicon:", f"{mocap.system}:", 1)
-                return pose_source(uri, self._limits.pose, open_within=_OPENS_WITHIN)
+                return pose_source(uri, self._limits.pose, open_within=_OPEN_TIMEOUT)
         return pose_source(str(mocap), self._limits.pose)
 
     def __enter__(self) -> "StartingVehicle":

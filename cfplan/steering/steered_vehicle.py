@@ -38,9 +38,9 @@ from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
 from cfplan.steering.recorded_steering import SteeringRecord, answer_text
 
 MOST_WAYPOINTS = 200  # of a request
-_TAKE_OFF_WITHIN = 120.0  # s, preflight and its waits included
+_TAKE_OFF_TIMEOUT = 120.0  # s, preflight and its waits included
 PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which a planner does not answer
-_LAND_WITHIN = 120.0  # s
+_LAND_TIMEOUT = 120.0  # s
 _FLYING = (Phase.STREAM, Phase.HOLD)
 
 
@@ -138,7 +138,7 @@ class SteeredVehicle:
         limits = self._limits
         if height is not None:
             if not (np.isreal(height) and math.isfinite(height)):
-                raise InputError(f"{height!r} is no height", where="take_off", hint="give metres above the origin")
+                raise InputError(f"{height!r} is not a height", where="take_off", hint="give metres above the origin")
             limits = replace(limits, ground=replace(limits.ground, take_off_height=float(height)))
         (x, y, _), yaw = self._flight.first_pose()
         timeline = hold_hover((x, y, limits.ground.take_off_height), yaw, limits)
@@ -153,11 +153,11 @@ class SteeredVehicle:
             self._on_record(self._recording)
         self._started = True
         self._flight.start(mission, timeline, Listeners(self._hear, self._hear_answer))
-        if not self._flight.wait(lambda: self._phase in _FLYING and self._sent is not None, _TAKE_OFF_WITHIN):
+        if not self._flight.wait(lambda: self._phase in _FLYING and self._sent is not None, _TAKE_OFF_TIMEOUT):
             self._require_flying()
             self._end(Order.LAND)
             raise PreflightError(
-                f"it did not hover within {_TAKE_OFF_WITHIN:.0f} s, and was landed",
+                f"it did not hover within {_TAKE_OFF_TIMEOUT:.0f} s, and was landed",
                 where=self._uri,
                 hint="see the record's events; raise ground.take_off_speed if the climb takes that long",
             )
@@ -268,7 +268,7 @@ class SteeredVehicle:
 
     def finish(self) -> None:
         """Fly what is committed to its end, then land, disarm, and return. Raises as `land` does."""
-        self._end(Order.FINISH, self._ends + _LAND_WITHIN)
+        self._end(Order.FINISH, self._ends + _LAND_TIMEOUT)
         self.land()
 
     def cut(self) -> None:
@@ -300,7 +300,7 @@ class SteeredVehicle:
 
     # Within.
 
-    def _end(self, order: Order, patience: float = _LAND_WITHIN) -> None:
+    def _end(self, order: Order, patience: float = _LAND_TIMEOUT) -> None:
         """Give an order that ends the flight, and wait until it has ended. Raises LinkError where it does not."""
         if self._flight.outcome is not None:
             return
@@ -354,7 +354,7 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
     try:
         points = np.array(waypoints, dtype=float)
     except (TypeError, ValueError):
-        raise InputError("these are no numbers", where="waypoints", hint=hint) from None
+        raise InputError("these are not numbers", where="waypoints", hint=hint) from None
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint=hint)
     if len(points) > MOST_WAYPOINTS:
@@ -363,7 +363,9 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
         )
     if not np.isfinite(points).all():
         at = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
-        raise InputError(f"{points[at].tolist()} is no place", where=f"waypoint {at + 1}", hint="give finite numbers")
+        raise InputError(
+            f"{points[at].tolist()} is not a position", where=f"waypoint {at + 1}", hint="give finite numbers"
+        )
     return tuple((x, y, z) for x, y, z in points.tolist())
 
 

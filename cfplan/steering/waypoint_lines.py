@@ -98,7 +98,7 @@ def parse_line(text: str) -> tuple[Wish, tuple[Triple, ...]]:
     try:
         numbers = [float(word) for word in rest.replace(",", " ").split()]
     except ValueError:
-        raise InputError(f"{text.strip()[:60]!r} is no waypoint", where="line", hint=_HINT) from None
+        raise InputError(f"{text.strip()[:60]!r} is not a waypoint", where="line", hint=_HINT) from None
     if not numbers or len(numbers) % 3:
         raise InputError(f"{len(numbers)} numbers, not three for each waypoint", where="line", hint=_HINT)
     rows = [numbers[at : at + 3] for at in range(0, len(numbers), 3)]
@@ -316,7 +316,7 @@ def _remove_left_over(path: Path) -> None:
     except FileNotFoundError:
         return
     if not stat.S_ISSOCK(found.st_mode):
-        raise InputError("exists, and is no socket", where=_shown(path), hint="name another path, or remove that")
+        raise InputError("exists, and is not a socket", where=_shown(path), hint="name another path, or remove that")
     with socket.socket(socket.AF_UNIX) as probe:
         try:
             probe.connect(str(path))

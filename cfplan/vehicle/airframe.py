@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Any, get_args
 
 import numpy as np
@@ -47,7 +47,7 @@ class Airframe:
     velocity_moment: tuple[float, float] = (0.0, 0.0)
     """N m per m/s, moment about x by velocity along y, and about -y by velocity along x, in body axes."""
     thrust_scale: float = 1.0
-    """Actual over commanded thrust in hover."""
+    """Actual over commanded thrust in hover; the controller is told, so that it commands less of a strong vehicle."""
     thrust_curvature: float = 0.0
     """Fraction by which thrust around hover grows more slowly than in proportion to the command."""
     lift_with_speed: float = 0.0
@@ -64,9 +64,17 @@ class Airframe:
         return self.mass * GRAVITY / 4
 
     @property
+    def thrust_range(self) -> tuple[float, float]:
+        """Return the thrusts of one motor, N, between which plans lie.
+
+        A thrust scale is known in hover alone: one below 1 lowers the most, one above 1 does not raise it.
+        """
+        return self.motor_thrust_min * max(self.thrust_scale, 1.0), self.motor_thrust_max * min(self.thrust_scale, 1.0)
+
+    @property
     def command_per_thrust(self) -> float:
         """Return 16-bit units of a motor's command per N of collective thrust: what ctrlMel.massThrust should be."""
-        return 65535 / (4 * self.motor_thrust_max)
+        return 65535 / (4 * self.motor_thrust_max * self.thrust_scale)
 
     @property
     def mixing(self) -> NDArray:
@@ -74,11 +82,18 @@ class Airframe:
         levers = np.array([self.arm, self.arm, self.thrust_to_torque])
         return np.vstack([np.ones(4), levers[:, None] * MOTOR_TORQUE_SIGNS])
 
+    def simplified(self) -> "Airframe":
+        """Return it without what real flights add to the bodies of RotorPy and drone-models."""
+        return replace(
+            self, velocity_moment=(0.0, 0.0), thrust_scale=1.0, thrust_curvature=0.0, lift_with_speed=0.0,
+            voltage_sag=0.0,
+        )  # fmt: skip
+
 
 UNPLANNED = frozenset(
     ("velocity_moment", "thrust_scale", "thrust_curvature", "lift_with_speed", "voltage_sag", "motor_curve", "spread")
 )
-"""Fields that affect simulation but not plans, so that datasets need not hold them."""
+"""Fields that datasets do not hold: networks see none of them."""
 
 
 def airframe_of(values: Mapping[str, Any]) -> Airframe:

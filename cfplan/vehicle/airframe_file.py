@@ -59,10 +59,10 @@ def read_airframe(file: Path | str) -> Airframe:
     """
     content, places = read_yaml_with_places(file, _AirframeFile)
     airframe = airframe_of(content.model_dump())
-    if not airframe.motor_thrust_min < airframe.hover_thrust < airframe.motor_thrust_max:
+    least, most = airframe.thrust_range
+    if not least < airframe.hover_thrust < most:
         raise InputError(
-            f"it cannot hover: each motor needs {airframe.hover_thrust:.3g} N and gives "
-            f"{airframe.motor_thrust_min:g} to {airframe.motor_thrust_max:g} N",
+            f"it cannot hover: each motor needs {airframe.hover_thrust:.3g} N and gives {least:.4g} to {most:.4g} N",
             where=places.where("motor_thrust_max"),
             hint="masses are in kg, thrusts in N for one motor",
         )

@@ -4,8 +4,14 @@ Sources:
   RotorPy    `rotorpy.vehicles.crazyflie_params` and `crazyfliebrushless_params` of RotorPy 3.0.0
   models     `drone_models/data/params.toml` of drone-models 0.1.0: identified on flying vehicles with markers
   firmware   crazyflie-firmware 2026.08: the motor thrust caps, which hold while the battery does (above about 3.1 V)
-  flights    public logs of flights, docs/results/real-flights.md: the brushless vehicle's drag and inertia, whose
-             yaw is in proportion; everything in AS_FLOWN
+  flights    public logs of flights, docs/results/real-flights.md: moment and lift with speed, the brushless vehicle's
+             drag and inertia, whose yaw is in proportion
+
+A thrust scale belongs to a motor curve. That of the 2.1+ is by the PWM and battery voltage of 2.1s with decks: 1.04 by
+the curve of firmware 2026.08, without curvature; 1.02 to 1.09 in the hover of four flights. The upgrade's logs (1.5
+times the thrust that a firmware without its curve commands) have no voltage. By the curve of 2026.08 the brushless logs
+show 1.3 to 1.4 with a slope of 1.7: they are of other propellers. The scale of these two is 1 until a hover says more.
+Motor lags are those of `models`: flights show 0.07 to 0.10 s and 0.035 to 0.055 s, which changes nothing sideways.
 
 Where `models` gives rotor dynamics n' = k₁(u − n) + k₂(u² − n²), up and down apart, the time constant here is the mean
 of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does. The rotor reaction is
@@ -14,11 +20,8 @@ firmware's default gains wherever the time constant exceeds 0.1 s.
 """
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 from cfplan.errors import InputError
 from cfplan.vehicle.airframe import GRAVITY, Airframe
@@ -27,6 +30,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 _CURVE_21_PLUS = (-0.02476537915958403, 0.06523793527519485, -0.026792504967750107, 0.006776789303971145, 0.12)
 _CURVE_UPGRADE = (0.006728127583707208, 0.01011557616217668, 0.010263198062061085, 0.0028358638322392503, 0.18)
 _CURVE_BRUSHLESS = (-0.014058926705279723, 0.04265273261724981, 0.0018327760144017432, 0.0020576974784587178, 0.20)
+_LIFT = 0.008  # 1/(m/s)², median of brushed and brushless flights at up to 2.4 m/s
 _ROTORPY_HOVER = (0.030 * GRAVITY / 4 / 2.3e-8) ** 0.5  # rad/s, from mass and k_eta
 
 AIRFRAMES = MappingProxyType(
@@ -55,8 +59,11 @@ AIRFRAMES = MappingProxyType(
                 motor_thrust_max=0.12,
                 motor_time_constant=0.105,
                 drag=(0.01351483, 0.01677452),
-                source="drone-models 0.1.0 cf2x_P250, measured with markers; thrust cap of firmware 2026.08",
+                source="drone-models 0.1.0 cf2x_P250; moment, scale, lift: public flights; cap of firmware 2026.08",
                 rotor_reaction=3.98e-4,
+                velocity_moment=(4.9e-4, 6.0e-4),
+                thrust_scale=1.04,
+                lift_with_speed=_LIFT,
                 motor_curve=_CURVE_21_PLUS,
             ),
             Airframe(
@@ -69,8 +76,10 @@ AIRFRAMES = MappingProxyType(
                 motor_thrust_max=0.18,
                 motor_time_constant=0.079,
                 drag=(0.01556697, 0.02191672),
-                source="drone-models 0.1.0 cf2x_T350, measured with markers; thrust cap of firmware 2026.08",
+                source="drone-models 0.1.0 cf2x_T350; moment, lift: public flights; thrust cap of firmware 2026.08",
                 rotor_reaction=3.89e-4,
+                velocity_moment=(4.6e-4, 5.5e-4),
+                lift_with_speed=_LIFT,
                 motor_curve=_CURVE_UPGRADE,
             ),
             Airframe(
@@ -83,37 +92,15 @@ AIRFRAMES = MappingProxyType(
                 motor_thrust_max=0.20,
                 motor_time_constant=0.060,
                 drag=(0.36 * 0.04338, 0.37 * 0.04338),
-                source="drone-models 0.1.0 cf21B_500; drag, inertia: public flights; thrust cap of firmware 2026.08",
+                source="drone-models 0.1.0 cf21B_500; drag, inertia, moment, lift: flights; cap of firmware 2026.08",
                 rotor_reaction=2.98e-4,
+                velocity_moment=(4.9e-4, 6.5e-4),
+                lift_with_speed=_LIFT,
                 motor_curve=_CURVE_BRUSHLESS,
             ),
         )
     }
 )
-
-
-AS_FLOWN: Mapping[str, Mapping[str, Any]] = MappingProxyType(
-    {
-        "crazyflie-2.1+": {
-            "velocity_moment": (4.5e-4, 6.2e-4), "thrust_scale": 1.06, "thrust_curvature": 0.1,
-            "lift_with_speed": 0.008, "drag": (0.01351483, 0.37 * 0.0318), "motor_time_constant": 0.080,
-        },
-        "crazyflie-thrust-upgrade": {
-            "velocity_moment": (4.6e-4, 5.5e-4), "thrust_scale": 1.50, "thrust_curvature": 0.3,
-            "lift_with_speed": 0.008, "drag": (0.01556697, 0.37 * 0.0379), "motor_time_constant": 0.065,
-        },
-        "crazyflie-2.1-brushless": {
-            "velocity_moment": (4.9e-4, 6.5e-4), "thrust_scale": 0.95, "thrust_curvature": -0.1,
-            "lift_with_speed": 0.008, "voltage_sag": 0.39, "motor_time_constant": 0.045,
-        },
-    }
-)  # fmt: skip
-"""Further values of each kind from public flights, by field, to predict real vehicles."""
-
-
-def as_flown(airframe: Airframe) -> Airframe:
-    """Return a shipped airframe with the values that public flights show; others are as in their files."""
-    return replace(airframe, **AS_FLOWN.get(airframe.name, {}))
 
 
 def load_airframe(name_or_file: str | Path) -> Airframe:

@@ -96,15 +96,15 @@ class JoinedTrajectory:
 
     def since(self, time: float) -> "JoinedTrajectory":
         """Return the same flight on a clock that is 0 at `time`, s, without what is flown LOOK_BACK before."""
-        first = self._first_since(time)
+        first = self._index_at(time)
         return JoinedTrajectory(self.trajectories[first:], tuple(start - time for start in self.starts[first:]))
 
     def kept_from(self, time: float) -> "JoinedTrajectory":
         """Return the same flight without the trajectories that since() leaves out at `time`, s; its clock stays."""
-        first = self._first_since(time)
+        first = self._index_at(time)
         return JoinedTrajectory(self.trajectories[first:], self.starts[first:])
 
-    def _first_since(self, time: float) -> int:
+    def _index_at(self, time: float) -> int:
         return max(int(np.searchsorted(self.starts, time - LOOK_BACK, side="right")) - 1, 0)
 
     def continued(self, time: float, trajectory: Trajectory) -> "JoinedTrajectory":

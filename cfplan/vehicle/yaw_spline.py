@@ -21,7 +21,7 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
-_STILL = 1e-6  # rad, and rad by nominal time, that yaw is off or turns at most where it stays as it is
+_SAME_YAW = 1e-6  # rad, and rad by nominal time, that yaw is off or turns at most where it stays as it is
 SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
 SETTLING_LENGTH, TURN = 1.0, 0.3  # s of nominal time, at least, and rad a second of it, to turn from a boundary state
 SAMPLES = 16  # an interval, where the direction of flight is followed
@@ -57,7 +57,7 @@ class YawSpline:
     @classmethod
     def fixed(cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None) -> "YawSpline":
         """Return one angle all along, which begins with the yaw of a boundary state where given."""
-        still = start is not None and abs(start.yaw - angle) < _STILL and abs(start.dyaw) < _STILL
+        still = start is not None and abs(start.yaw - angle) < _SAME_YAW and abs(start.dyaw) < _SAME_YAW
         if start is None or still:
             return cls(np.full(nodes + 1, start.yaw if start else angle), np.zeros(nodes + 1), np.zeros(nodes))
         angle += 2 * np.pi * np.round((start.yaw - angle) / (2 * np.pi))  # the turn of 2π that is nearest

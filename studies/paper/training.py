@@ -22,7 +22,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from cfplan.errors import InputError
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 from cfplan.learning.checkpoints import CHECKPOINT, Epoch, resume, save_checkpoint
 from cfplan.learning.dataset_spec import Relabel
 from studies.paper.networks import SIZES, Kind, SequenceNetwork, build_network
@@ -312,5 +312,5 @@ def _save(network: SequenceNetwork, file: Path, card: dict[str, Any]) -> None:
     """Write the weights and their card atomically."""
     weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items()}
     file.parent.mkdir(parents=True, exist_ok=True)
-    with whole(file) as unfinished:
+    with atomic_write(file) as unfinished:
         save_file(weights, unfinished, metadata={"card": json.dumps(card)})

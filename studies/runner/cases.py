@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cfplan.errors import InputError
-from cfplan.files.whole import write_whole
+from cfplan.files.atomic import write_atomically
 from cfplan.learning.workers import pool
 from studies.runner.provenance import provenance
 from studies.runner.result import StudyResult
@@ -137,13 +137,13 @@ def _resume(file: Path, header: Mapping[str, Any], say: Callable[[str], None]) -
     try:
         lines = _lines(file) if file.is_file() else []
         if lines and {**lines[0], "commit": ""} == {**header, "commit": ""}:
-            write_whole(file, _text(lines))  # drops a last line that a kill has cut off
+            write_atomically(file, _text(lines))  # drops a last line that a kill has cut off
             return {line["name"]: _Done(**line) for line in lines[1:]}
         if lines:
             aside = file.with_name(file.name.removesuffix(UNFINISHED) + STALE + str(lines[0].get("commit"))[:SHORT])
             file.replace(aside)
             say(f"{aside}: {len(lines) - 1} cases of other sources or settings, stale: all are measured anew")
-        write_whole(file, _text([header]))
+        write_atomically(file, _text([header]))
     except OSError as error:
         raise _unwritable(file, error) from None
     return {}

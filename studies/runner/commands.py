@@ -71,9 +71,7 @@ def study_command(name: str, module: str) -> click.Command:
     return click.command(name, help=found.__doc__, epilog=example)(callback)
 
 
-WORKERS = click.option(
-    "--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes on this machine."
-)
+WORKERS = click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Number of processes.")
 SCHEDULER = click.option("--scheduler", metavar="ADDRESS", help="Dask cluster to use instead: tcp://host:port.")
 _EFFORT = (
     WORKERS,

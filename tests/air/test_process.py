@@ -1,21 +1,20 @@
 """The planner's process: what it proposes verifies, and whatever happens to it the pilot has what is committed."""
 
 import multiprocessing
-import os
 import signal
 from dataclasses import replace
 
 import numpy as np
 import psutil
 import pytest
-from waiting import a_moment, until
+from waiting import PATIENCE, a_moment, until
 
-from cfplan.air.core import NOT_FLOWN
+from cfplan.air.core import NO_ANSWER, NOT_FLOWN, ON_ITS_WAY
 from cfplan.air.process import AirPlanner
 from cfplan.air.replanning import replan
 from cfplan.air.requests import PathAnswer, PathVerdict, Wish
 from cfplan.air.timeline import hold
-from cfplan.flight.clock import REAL_CLOCK, Clock
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import ReceivedProposals
 from cfplan.flight.setpoints.commitment import (
     LEAST_AHEAD,
@@ -32,7 +31,6 @@ from cfplan.flight.setpoints.packets import decode
 from cfplan.geometry.min_snap import centripetal_times, min_snap
 from cfplan.planning.plan import plan
 
-LATE = 1.5  # s, longer than a planner waits for an answer
 FAR = ((-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9), (-0.8, 1.5, 1.0), (0.0, -2.0, 1.0))
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
 
@@ -43,33 +41,31 @@ class PilotSide:
     Where this computer is slow its time stands still until a proposal is there, so that none is late.
     """
 
-    def __init__(self, commitment, limits, connection, clock: Clock = REAL_CLOCK):
-        self.commitment, self.limits, self.clock = commitment, limits, clock
-        self.proposals = ReceivedProposals(connection, clock)
+    def __init__(self, commitment, limits, connection):
+        self.commitment, self.limits = commitment, limits
+        self.proposals = ReceivedProposals(connection)
         self.begun = 0.0
         self.given: list[Commitment | Refusal] = []
-        self.refuses: int | None = None  # number of the proposal that is refused, whatever it is
-        self.silent_for: float | None = None  # s, for which the next answer is kept back
+        self.silent = False  # answers are kept back until it speaks
+        self.kept: list[tuple[Proposal, Commitment | Refusal]] = []
         self.told: list[PathAnswer] = []  # by the planner, and not looked at yet
 
-    def begin(self, ago: float = 0.0) -> None:
-        self.begun = self.clock.now() - ago
+    def begin(self) -> None:
+        self.begun = REAL_CLOCK.now()
         self.proposals.begin(self.begun)
 
     def tick(self) -> None:
         proposal = self.proposals.newest()
         if proposal is not None:
-            now = min(round((self.clock.now() - self.begun) * RATE), proposal.splice - LEAST_AHEAD)
+            now = min(round((REAL_CLOCK.now() - self.begun) * RATE), proposal.splice - LEAST_AHEAD)
             answer = splice(self.commitment, proposal, now, self.limits)
-            if len(self.given) == self.refuses:
-                answer = Refusal(Fault.MOTION, "")
             if isinstance(answer, Commitment):
                 self.commitment = answer
             self.given.append(answer)
-            if self.silent_for is not None:
-                REAL_CLOCK.sleep(self.silent_for)
-                self.silent_for = None
-            self.proposals.answer(proposal, answer)
+            self.kept.append((proposal, answer))
+        if not self.silent:
+            while self.kept:
+                self.proposals.answer(*self.kept.pop(0))
 
 
 @pytest.fixture(scope="module")
@@ -101,12 +97,29 @@ def answer_to(number: int, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
 
 
 def in_time(wish: Wish, waypoints, planner: AirPlanner, pilot: PilotSide) -> PathAnswer:
-    """Ask until the answer is not that it came too late, as on a busy computer."""
-    for _ in range(5):
+    """Ask until the answer is not that the plan or the pilot's answer came too late, as on a busy computer.
+
+    A pilot that answered too late has accepted all the same; then that answer is returned.
+    """
+    answer = PathAnswer(0, PathVerdict.LATE)
+
+    def settled() -> bool:
+        nonlocal answer
         answer = answer_to(planner.request(wish, waypoints), planner, pilot)
-        if answer.verdict is not PathVerdict.LATE:
-            break
+        return answer.verdict is not PathVerdict.LATE and answer.reason != NO_ANSWER
+
+    assert until(settled), answer
+    if answer.reason == ON_ITS_WAY:
+        answer = [each for each in pilot.told if each.verdict is PathVerdict.ACCEPTED][-1]
     return answer
+
+
+def stopped(planner: AirPlanner) -> psutil.Process:
+    """Stop the planner's process, and return it once it stands still."""
+    process = psutil.Process(planner.process_id)
+    process.suspend()
+    assert until(lambda: process.status() == psutil.STATUS_STOPPED)
+    return process
 
 
 def begin(planner: AirPlanner, pilot: PilotSide) -> None:
@@ -135,9 +148,14 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
     # Late in the flight or after it, as slowly as this computer plans: from rest at the latest.
     answer = in_time(Wish.REPLACE, [(0.0, 0.5, 1.0)], planner, pilot)
     assert answer.verdict is PathVerdict.ACCEPTED, answer
-    assert isinstance(pilot.given[-1], Commitment)
-    assert answer.splice in pilot.commitment.splices
+    committed = [each for each in pilot.given if isinstance(each, Commitment)]
+    (flown,) = (each for each in committed if each.splices[-1] == answer.splice)
     assert answer.joint == pytest.approx(answer.splice / RATE + LEAD)
+    numbers = np.arange(answer.splice, answer.splice + 20)
+    setpoints = decode(flown.payloads[numbers - flown.first])
+    planned = answer.plan.trajectory.at(numbers / RATE + LEAD - answer.joint)
+    np.testing.assert_allclose(setpoints.position, planned.position, atol=QUANTUM)
+    np.testing.assert_allclose(setpoints.velocity, planned.velocity, atol=QUANTUM)
 
     def goes_on() -> bool:
         pilot.tick()
@@ -145,45 +163,52 @@ def test_requests_are_answered_and_the_pilot_is_committed_to_what_was_accepted(b
         return pilot.commitment.splices[-1] > answer.splice or bool(np.abs(end - (0.0, 0.5, 1.0)).max() < 2e-3)
 
     assert until(goes_on)  # behind its first part
-    numbers = np.arange(answer.splice, answer.splice + 20)
-    committed = decode(pilot.commitment.payloads[numbers - pilot.commitment.first])
-    planned = answer.plan.trajectory.at(numbers / RATE + LEAD - answer.joint)
-    np.testing.assert_allclose(committed.position, planned.position, atol=QUANTUM)
-    np.testing.assert_allclose(committed.velocity, planned.velocity, atol=QUANTUM)
     again = in_time(Wish.EXTEND, [(0.5, -0.5, 1.0)], planner, pilot)
     assert again.verdict is PathVerdict.ACCEPTED, again
+
+
+def proposed(planner: AirPlanner, pilot: PilotSide) -> Proposal:
+    """Ask until there is a proposal, which the pilot has not answered."""
+    asked, found = None, None
+
+    def there_is_one() -> bool:
+        nonlocal asked, found
+        pilot.told.extend(planner.answers())
+        if asked is None or any(each.number == asked for each in pilot.told):  # it came too late
+            asked = planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)])
+        found = pilot.proposals.newest()
+        return found is not None
+
+    assert until(there_is_one)
+    assert found is not None
+    return found
 
 
 def test_a_request_that_comes_while_a_proposal_is_with_the_pilot_is_answered(both):
     planner, pilot = both
     begin(planner, pilot)
-    planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)])
-    proposals: list[Proposal] = []
-
-    def proposed() -> bool:
-        proposals.extend(filter(None, [pilot.proposals.newest()]))
-        return bool(proposals)
-
-    assert until(proposed)
-    another = planner.request(Wish.REPLACE, [(0.0, 7.0, 1.0)])
-    a_moment()  # the planner's process reads it, and waits for the pilot
-    pilot.proposals.answer(proposals[0], Refusal(Fault.MOTION, ""))
-    assert "waypoint 1" in answer_to(another, planner, pilot).reason
+    reason = NO_ANSWER
+    while reason == NO_ANSWER:  # where this computer is so busy that the planner gives up meanwhile
+        proposal = proposed(planner, pilot)
+        read, another = (planner.request(Wish.REPLACE, [(0.0, 7.0, 1.0)]) for _ in range(2))
+        answer_to(read, planner, pilot)  # it is superseded: the planner has read both, and waits for the pilot
+        pilot.proposals.answer(proposal, Refusal(Fault.MOTION, ""))
+        reason = answer_to(another, planner, pilot).reason
+    assert "waypoint 1" in reason
 
 
 def test_the_latest_request_wins(both):
     planner, pilot = both
     begin(planner, pilot)
-    assert planner.process_id is not None
-    os.kill(planner.process_id, signal.SIGSTOP)  # so that it finds all of them, however slowly they are asked for
+    process = stopped(planner)  # so that it finds all of them, however slowly they are asked for
     numbers = [planner.request(Wish.REPLACE, [(0.0, 0.1 * k, 1.0)]) for k in range(6)]
-    os.kill(planner.process_id, signal.SIGCONT)
+    process.resume()
     answers: list[PathAnswer] = []
 
     def all_answered() -> bool:
         pilot.tick()
         answers.extend(planner.answers())
-        return len(answers) == len(numbers)
+        return {answer.number for answer in answers} >= set(numbers)
 
     assert until(all_answered)
     verdicts = {answer.number: answer.verdict for answer in answers}
@@ -193,37 +218,35 @@ def test_the_latest_request_wins(both):
 
 
 def test_an_answer_that_comes_late_leaves_both_sides_with_the_same_commitment(both):
-    """Longer than the planner waits for it: nobody is to plan on from what the pilot has left meanwhile."""
+    """Longer than the planner waits for it: it must not plan on from what the pilot has left meanwhile."""
     planner, pilot = both
-    pilot.begin()
-    assert until(lambda: answer_to(planner.request(Wish.EXTEND), planner, pilot).reason != NOT_FLOWN)
-    far = [(-0.5, 0.8, 1.0), (0.5, 2.0, 1.0), (-0.8, 0.4, 1.2), (0.8, -1.5, 0.9)]
-    while not any(isinstance(answer, Commitment) for answer in pilot.given):
-        pilot.silent_for = LATE
-        number = planner.request(Wish.REPLACE, far)
+    begin(planner, pilot)
+    pilot.silent = True
+    while not pilot.kept:
+        number = planner.request(Wish.REPLACE, FAR[:4])
         told = answer_to(number, planner, pilot)
     assert (told.number, told.verdict) == (number, PathVerdict.REFUSED)
     assert "the pilot does not answer" in told.reason
-    assert answer_to(number, planner, pilot).verdict is PathVerdict.ACCEPTED  # it is flown after all
-    later = [answer_to(planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)]), planner, pilot) for _ in range(2)]
-    assert not any(answer.reason.startswith(Fault.ORDER) for answer in later), later
-    assert any(answer.verdict is PathVerdict.ACCEPTED for answer in later), later
+    pilot.silent = False
+    while told.verdict is not PathVerdict.ACCEPTED:  # it is flown after all
+        told = answer_to(number, planner, pilot)
+    later = [in_time(Wish.REPLACE, [(0.0, y, 1.0)], planner, pilot) for y in (0.5, -0.5)]
+    assert [answer.verdict for answer in later] == [PathVerdict.ACCEPTED] * 2, later
+    assert all(isinstance(answer, Commitment) for answer in pilot.given)
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(both, held, how):
     planner, pilot = both
-    pilot.begin()
-    assert planner.process_id is not None
-    planner.request(Wish.REPLACE, [(0.0, 0.5, 1.0)])
-    os.kill(planner.process_id, how)
-    planner.request(Wish.STOP)
-    for _ in range(20):
+    begin(planner, pilot)
+    process = stopped(planner)
+    process.send_signal(how)
+    for wish, waypoints in ((Wish.REPLACE, [(0.0, 0.5, 1.0)]), (Wish.STOP, ())):
+        planner.request(wish, waypoints)
+        a_moment()
         pilot.tick()
-        REAL_CLOCK.sleep(0.01)
     assert pilot.commitment is held.commitment
-    # Before the signal came it may have refused the first request, as nothing was flown yet.
-    assert {(answer.number, answer.verdict) for answer in planner.answers()} <= {(1, PathVerdict.REFUSED)}
+    assert planner.answers() == []
 
 
 def test_what_is_no_proposal_is_none(held):
@@ -256,19 +279,22 @@ def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):
     """A plan is committed in parts, the last of them long before it is flown; then another one replaces it."""
     planner, pilot = both
     begin(planner, pilot)
-    first = in_time(Wish.REPLACE, FAR, planner, pilot)
-    assert first.verdict is PathVerdict.ACCEPTED, first
 
     def all_of_it() -> bool:
         pilot.tick()
         end = decode(pilot.commitment.payloads[-1:]).position[0]
         return bool(np.abs(end - FAR[-1]).max() < 2e-3)
 
-    assert until(all_of_it)
-    ends = len(pilot.commitment.payloads) / RATE
-    second = in_time(Wish.REPLACE, [(0.0, 0.5, 1.0)], planner, pilot)
-    assert second.verdict is PathVerdict.ACCEPTED, second
-    assert second.joint < ends
+    def replaced_from_near() -> bool:
+        first = in_time(Wish.REPLACE, FAR, planner, pilot)
+        assert first.verdict is PathVerdict.ACCEPTED, first
+        assert until(all_of_it)
+        ends = pilot.commitment.motion_ends / RATE
+        second = in_time(Wish.REPLACE, [(0.0, 0.5, 1.0)], planner, pilot)
+        assert second.verdict is PathVerdict.ACCEPTED, second
+        return second.joint < ends
+
+    assert until(replaced_from_near)  # on a busy computer the vehicle may have arrived meanwhile
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
@@ -288,4 +314,4 @@ def test_nothing_of_a_planner_that_was_killed_goes_on(both, how):
     beside = psutil.Process(planner.process_id).children()
     assert beside
     psutil.Process(planner.process_id).send_signal(how)
-    assert not psutil.wait_procs(beside, timeout=10.0)[1]
+    assert not psutil.wait_procs(beside, timeout=PATIENCE)[1]

@@ -61,6 +61,12 @@ def make_limits() -> Limits:
     )  # fmt: skip
 
 
+def _hover_command() -> float:
+    airframe = make_limits().airframe
+    return 65535 * airframe.hover_thrust / airframe.motor_thrust_max  # without a motor curve
+
+
+HOVER_COMMAND = _hover_command()
 GOOD_VALUES = {rule.name: rule.value(make_limits()) for rule in PARAMETER_RULES}
 
 
@@ -101,6 +107,8 @@ class World:
     poses_stopped: bool = False
     estimate_silent: bool = False
     status_silent: bool = False
+    status_every: int = 2  # 5 ms between reports of motors and battery
+    hover_command: float = HOVER_COMMAND
     uplink_dead: bool = False
     revived: list[str] = field(default_factory=list)  # logs that the pilot created anew
     restarts: bool = True
@@ -196,10 +204,10 @@ class World:
             flying = self.motors_on or self.now - self.motors_off_since < 2.0
             bits = (ARMED if self.armed else 0) | (FLYING if flying else 0) | self.extra_bits
             bits |= CAN_FLY if self.can_fly else 0
-            motor = 4 * (40000 if self.motors_on else 0,)
+            motor = 4 * (round(self.hover_command) if self.motors_on else 0,)
             if not self.estimate_silent:
                 self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
-            if not self.status_silent:
+            if not self.status_silent and self._count % self.status_every == 0:
                 self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), motor, self.voltage, bits)
 
     # The pose source.
@@ -250,7 +258,7 @@ class World:
     def end_motor_test(self) -> None:
         self.motor_test = False
 
-    def revive_log(self, name: str) -> None:
+    def recreate_log(self, name: str) -> None:
         if name not in self.revived:
             self.revived.append(name)
 

@@ -58,7 +58,7 @@ def test_what_is_lost_is_told(load):
 def test_a_gap_is_told(load):
     rows = circle()
     told = load(np.delete(rows, slice(300, 380), axis=0)).losses
-    assert any("nothing is known for 0.8 s before 3.8 s" in each for each in told)
+    assert any("there are no samples for 0.8 s before 3.8 s" in each for each in told)
 
 
 def test_the_rate_does_not_matter(load):

@@ -6,7 +6,7 @@ import pytest
 
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from studies.identification import draw_vehicle, fly_drawn
+from studies.identification import draw_vehicle, fly_drawn, unknown_vehicle
 
 REPOSITORY = Path(__file__).parents[2]
 SEED = 4
@@ -14,7 +14,7 @@ SEED = 4
 
 @pytest.fixture(scope="session")
 def limits():
-    return load_limits(REPOSITORY / "safety.yaml")
+    return unknown_vehicle(load_limits(REPOSITORY / "safety.yaml"))
 
 
 @pytest.fixture(scope="session")

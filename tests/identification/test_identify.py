@@ -7,6 +7,7 @@ import pytest
 from one_body import stepped
 
 from cfplan.errors import InputError
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.identification.advice import deviation_per_speed, suggests_identification
 from cfplan.identification.airframe_yaml import airframe_text, safety_lines, write_airframe
 from cfplan.identification.identify import identify
@@ -40,7 +41,7 @@ def cut(record: Record, seconds: float) -> Record:
 
 def test_the_truth_of_a_drawn_vehicle_is_found(found, drawn):
     true, quantities = drawn.airframe, found.quantities
-    assert found.airframe.motor_thrust_max == pytest.approx(true.motor_thrust_max, rel=0.012)
+    assert found.airframe.thrust_scale == pytest.approx(true.thrust_scale, rel=0.012)
     assert found.airframe.motor_time_constant == pytest.approx(true.motor_time_constant, abs=0.006)
     assert found.airframe.drag[0] == pytest.approx(true.drag[0], rel=0.08)
     assert found.airframe.drag[1] == pytest.approx(true.drag[1], rel=0.25)
@@ -55,7 +56,7 @@ def test_the_truth_of_a_drawn_vehicle_is_found(found, drawn):
 def test_stated_uncertainties_cover_the_errors(found, drawn):
     true = drawn.airframe
     truths = {
-        "thrust scale": true.motor_thrust_max / AIRFRAMES["crazyflie-2.1+"].motor_thrust_max,
+        "thrust scale": true.thrust_scale,
         "motor lag": true.motor_time_constant,
         "drag": true.drag[0],
         "axial drag": true.drag[1],
@@ -70,17 +71,18 @@ def test_without_a_weighed_mass_the_ratio_is_found_and_the_mass_held(record, dra
     found = identify([record])
     true, before = drawn.airframe, limits.airframe
     assert found.airframe.mass == before.mass
-    assert "weigh it" in found.quantities["mass"].untold
-    ratio = found.airframe.motor_thrust_max / found.airframe.mass
-    assert ratio == pytest.approx(true.motor_thrust_max / true.mass, rel=0.012)
+    assert "weigh the vehicle" in found.quantities["mass"].unobservable_reason
+    ratio = found.airframe.thrust_scale / found.airframe.mass
+    assert ratio == pytest.approx(true.thrust_scale / true.mass, rel=0.012)
     assert found.airframe.drag[0] / before.mass == pytest.approx(true.drag[0] / true.mass, rel=0.08)
 
 
 def test_motion_is_the_same_if_mass_thrust_drag_and_inertia_all_grow():
-    """Why no record can tell the mass: Newton's and Euler's equations are homogeneous in the four."""
+    """Why no record can tell the mass: Newton's and Euler's equations are homogeneous in them, moments too."""
     airframe, factor = AIRFRAMES["crazyflie-2.1+"], 1.3
     scaled = replace(
         airframe,
+        velocity_moment=tuple(factor * value for value in airframe.velocity_moment),
         mass=factor * airframe.mass,
         inertia=tuple(factor * value for value in airframe.inertia),
         motor_thrust_max=factor * airframe.motor_thrust_max,
@@ -107,7 +109,7 @@ def test_several_records_are_surer_than_one(record, drawn, found):
 def test_a_record_that_ends_early_says_less(record, drawn, found):
     less = identify([cut(record, 12.0)], mass=drawn.airframe.mass)
     assert less.quantities["drag"].deviation > found.quantities["drag"].deviation
-    assert less.airframe.motor_thrust_max == pytest.approx(drawn.airframe.motor_thrust_max, rel=0.02)
+    assert less.airframe.thrust_scale == pytest.approx(drawn.airframe.thrust_scale, rel=0.02)
 
 
 def test_a_record_without_a_flight_is_refused(record):
@@ -140,7 +142,7 @@ def test_messages_that_are_broken_or_come_twice_change_nothing(record, drawn, fo
     order = np.r_[0:300, 250:300, 299:200:-1, 300 : len(poses.time)]
     changed = rows(replace(poses, quaternion=broken[0], position=broken[1]), order)
     again = identify([replace(record, poses=changed)], mass=drawn.airframe.mass)
-    assert again.airframe.motor_thrust_max == pytest.approx(found.airframe.motor_thrust_max, rel=0.002)
+    assert again.airframe.thrust_scale == pytest.approx(found.airframe.thrust_scale, rel=0.002)
     assert again.airframe.drag[0] == pytest.approx(found.airframe.drag[0], rel=0.03)
 
 
@@ -166,7 +168,8 @@ def test_the_airframe_file_is_read_back_as_written(found, tmp_path):
     assert again.source == found.airframe.source
     assert again.drag == pytest.approx(found.airframe.drag, rel=1e-6)
     assert again.inertia == pytest.approx(found.airframe.inertia, rel=1e-6)
-    assert again.motor_thrust_max == pytest.approx(found.airframe.motor_thrust_max, rel=1e-6)
+    assert again.thrust_scale == pytest.approx(found.airframe.thrust_scale, rel=1e-6)
+    assert again.velocity_moment == pytest.approx(found.airframe.velocity_moment, rel=1e-6)
     assert f"latency: {found.pose_latency:.4f}" in safety_lines(found, file)
     assert "latency" not in safety_lines(replace(found, poses_misdated=False), file)
 
@@ -188,9 +191,9 @@ def test_a_file_is_overwritten_only_by_force(found, tmp_path):
 
 
 def test_deviation_that_grows_with_speed_suggests_identification(record):
-    poses = record.poses
-    wanted = np.column_stack([np.interp(poses.time, record.setpoints.due, p) for p in record.setpoints.position.T])
-    moving = np.column_stack([np.interp(poses.time, record.setpoints.due, v) for v in record.setpoints.velocity.T])
+    poses, planned = record.poses, record.setpoints.due + LEAD
+    wanted = np.column_stack([np.interp(poses.time, planned, p) for p in record.setpoints.position.T])
+    moving = np.column_stack([np.interp(poses.time, planned, v) for v in record.setpoints.velocity.T])
     noise = np.random.default_rng(2).normal(0.0, 0.01, wanted.shape)
     on_time = replace(record, poses=replace(poses, position=wanted + noise))
     late = replace(record, poses=replace(poses, position=wanted + noise - 0.03 * moving))

@@ -22,7 +22,7 @@ def test_a_record_becomes_an_airframe_that_safety_yaml_can_name(record, drawn, t
     mass = f"{drawn.airframe.mass:.4f}"
     result = CliRunner().invoke(cfplan, ["identify", str(record.folder), "--mass", mass, "-o", str(file)])
     assert result.exit_code == 0, result.output
-    for text in ("thrust scale", "motor lag", "pose latency", "vehicle: cf.yaml", "not told by these records"):
+    for text in ("thrust scale", "motor lag", "pose latency", "vehicle: cf.yaml", "not observable in these records"):
         assert text in result.output
     latency = next(line for line in result.output.splitlines() if "latency:" in line)
     text = (REPOSITORY / "safety.yaml").read_text()
@@ -38,7 +38,7 @@ def test_one_document_is_printed_where_json_is_asked_for(record, tmp_path):
     result = CliRunner().invoke(cfplan, ["identify", str(record.folder), "-o", str(file), "--json"])
     document = json.loads(result.output)
     assert document["quantities"]["drag"]["standard_uncertainty"] > 0
-    assert document["quantities"]["mass"]["untold"]
+    assert document["quantities"]["mass"]["unobservable_reason"]
 
 
 def test_a_file_that_is_there_is_refused_before_anything_is_read(tmp_path):

@@ -11,7 +11,7 @@ from cfplan.identification.signals import FlightSignals
 from cfplan.identification.translation import flight_model
 from cfplan.vehicle.airframes import AIRFRAMES
 
-NOMINAL = AIRFRAMES["crazyflie-2.1+"]
+NOMINAL = AIRFRAMES["crazyflie-2.1+"].simplified()
 MASS, THRUST_MAX, LAG, DRAG, AXIAL_DRAG = 0.0335, 0.113, 0.082, 0.0181, 0.0102
 ORIGIN, MOUNTING, LATE = np.array([0.006, -0.004, 0.012]), np.array([0.02, -0.03, 0.05]), 0.023
 HOVER = MASS * 9.81 / THRUST_MAX
@@ -69,7 +69,7 @@ def identified(signals):
 def test_the_independent_body_is_found():
     found = identified(fly(1.0))
     quantities = found.quantities
-    assert found.airframe.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.003)
+    assert found.airframe.thrust_scale * NOMINAL.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.003)
     assert found.airframe.drag[0] == pytest.approx(DRAG, rel=0.03)
     assert found.airframe.drag[1] == pytest.approx(AXIAL_DRAG, rel=0.05)
     assert found.airframe.motor_time_constant == pytest.approx(LAG, abs=0.002)
@@ -85,7 +85,7 @@ def test_the_independent_body_is_found():
 def test_what_a_hover_cannot_tell_is_said_and_kept():
     found = identified(fly(0.0))
     for name in ("motor lag", "drag", "axial drag"):
-        assert "too vague" in found.quantities[name].untold
+        assert "too uncertain" in found.quantities[name].unobservable_reason
     assert found.airframe.motor_time_constant == NOMINAL.motor_time_constant
     assert found.airframe.drag == NOMINAL.drag
-    assert found.airframe.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.01)
+    assert found.airframe.thrust_scale * NOMINAL.motor_thrust_max == pytest.approx(THRUST_MAX, rel=0.01)

@@ -122,7 +122,7 @@ def test_other_bytes_in_the_memory_keep_it_on_the_ground(line):
 
     def spoilt(channel, payload):
         answer = write(channel, payload)
-        memories.trajectory[100] ^= 1
+        memories.trajectory[100] = (memories.trajectory[100] + 1) % 256  # at each write, however many there are
         return answer
 
     memories.receive = spoilt

@@ -125,7 +125,7 @@ def assert_is_one_motion(flight: Flight, flown: JoinedTrajectory, limits, until:
     """What was sent up to a number is the encoding of one motion, which keeps every limit all along."""
     for trajectory in flown.trajectories:
         assert certify(trajectory, limits.plan, limits.space).passed
-    whole = encode_trajectory(flown, space=limits.space)
+    whole = encode_trajectory(flown, gains=gains_under(limits), space=limits.space)
     check_bytes(whole, flown, limits.plan)
     sent, planned = sent_of(flight), decode(whole.payloads)
     numbers = [number for number in sent if number < min(until, len(whole.payloads))]

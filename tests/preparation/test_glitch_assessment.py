@@ -7,12 +7,17 @@ import pytest
 
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.preparation.glitch_assessment import KEPT, assess_glitches
 from cfplan.preparation.local_slowing import slow_locally
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import require_glitch_margin
 from cfplan.simulation.glitches import TURNED_OVER, glitch_at_every_setpoint
 from tests.least_snap import along_least_snap
+
+
+def encoded_under(limits, trajectory):
+    return encode_trajectory(trajectory, gains=gains_under(limits), space=limits.space)
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +32,7 @@ def cut_at(limits, deviation):
 
 
 def test_the_loop_is_flown_through_gaps_with_a_margin(loop, limits):
-    encoded = encode_trajectory(loop.trajectory)
+    encoded = encoded_under(limits, loop.trajectory)
     moments, assessed = glitch_at_every_setpoint(encoded.payloads, limits), assess_glitches(encoded, limits)
     assert assessed.passed
     assert not moments.lost.any()
@@ -39,16 +44,16 @@ def test_the_loop_is_flown_through_gaps_with_a_margin(loop, limits):
 
 
 def test_a_plan_is_slowed_where_a_gap_nearly_loses_the_vehicle(loop, limits):
-    strict = cut_at(limits, 0.37)
-    assert not assess_glitches(encode_trajectory(loop.trajectory), strict).passed
-    slowed, _ = slow_locally(loop, lambda trajectory: [assess_glitches(encode_trajectory(trajectory), strict)])
-    assert assess_glitches(encode_trajectory(slowed.trajectory), strict).passed
+    strict = cut_at(limits, 0.32)
+    assert not assess_glitches(encoded_under(limits, loop.trajectory), strict).passed
+    slowed, _ = slow_locally(loop, lambda trajectory: [assess_glitches(encoded_under(limits, trajectory), strict)])
+    assert assess_glitches(encoded_under(limits, slowed.trajectory), strict).passed
     assert 0.0 < slowed.time_lost < 0.03
     assert slowed.slowing.reasons[0].startswith("a gap near (")
 
 
 def test_the_bytes_of_a_plan_without_that_margin_are_refused(loop, limits):
-    encoded = encode_trajectory(loop.trajectory)
+    encoded = encoded_under(limits, loop.trajectory)
     require_glitch_margin(encoded, limits)
     with pytest.raises(NotCertifiedError, match=r"a gap of 0\.2 s in setpoints takes the vehicle 0\.\d+ m off"):
-        require_glitch_margin(encoded, cut_at(limits, 0.35))
+        require_glitch_margin(encoded, cut_at(limits, 0.3))

@@ -22,6 +22,7 @@ from cfplan.flight.setpoints.commitment import Commitment, Fault, propose, splic
 from cfplan.flight.setpoints.descent import off_walls
 from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode, encode
+from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.continuation import check_waypoints
@@ -103,7 +104,7 @@ def test_link_loss_comes_as_near_to_an_obstacle_as_a_whole_simulation_does(past_
     )  # fmt: skip
     airframe = replace(past_the_pole.airframe, motor_time_constant=lag)
     here = replace(past_the_pole.limits, link_loss=lost, airframe=airframe)
-    sent = encode_trajectory(past_the_pole.trajectory, space=here.space).payloads
+    sent = encode_trajectory(past_the_pole.trajectory, gains=gains_under(here), space=here.space).payloads
     found = link_loss_at_every_setpoint(sent, here)
     apart = replace(here, space=replace(here.space, obstacles=()))
     np.testing.assert_array_equal(found.low, link_loss_at_every_setpoint(sent, apart).low)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.flight.telemetry import (
     Estimate,
     Event,
@@ -116,7 +117,7 @@ def flight_messages(seed: int = 0) -> list[Telemetry]:
     late = 0.0002 + np.abs(rng.normal(0, 0.0002, len(wanted)))
     late[400:402] = 0.012, 0.0025
     rows = np.round((wanted - STREAM + late) * 100).astype(int)  # a late packet carries the state of its own time
-    place, velocity, acceleration = reference(rows / 100)
+    place, velocity, acceleration = reference(rows / 100 + LEAD)
     asked = attitude(acceleration)
     for i, t in enumerate(MONOTONIC + wanted):
         messages.append(

@@ -10,6 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
+from cfplan.flight.setpoints.encoding import encode_trajectory
+from cfplan.geometry.min_snap import min_snap
 from cfplan.recording import record as columns
 from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
@@ -17,8 +19,13 @@ from cfplan.recording.record import Record
 from cfplan.recording.rerun.states import supervisor_states
 from cfplan.recording.summary import SETTLED, deviation, dropouts, pose_gaps, settling, shares, summarise, summary_text
 from cfplan.recording.writer import RecordWriter
+from cfplan.vehicle.airframes import AIRFRAMES
+from cfplan.vehicle.correction import PlanCorrection, corrected
+from cfplan.vehicle.trajectory import Trajectory
 
-BEGIN, TRAVEL, HELD = 100.0, 4.0, 2.0  # s
+BEGIN, HELD = 100.0, 2.0  # s
+LEAD, MOVING = 0.005, 4.0  # s by which setpoints are sent ahead of the plan, and for which it moves
+TRAVEL = LEAD + MOVING  # s, planned: it begins with a rest, so that it is straight between setpoints
 SPEED = 0.5  # m/s, along x
 
 
@@ -27,10 +34,10 @@ def straight_flight(
 ) -> Record:
     """A flight along x at SPEED, its end held; poses lag behind by `lag` s, fly `aside` m in y, and end off in z."""
     due = np.arange(BEGIN, min(BEGIN + TRAVEL + HELD + 1e-9, sent_until), 0.01)
-    where = np.clip(due - BEGIN, 0, TRAVEL) * SPEED
+    where = np.clip(due - BEGIN, 0, MOVING) * SPEED
     zeros = np.zeros_like(due)
     time = np.arange(BEGIN - 1, BEGIN + TRAVEL + HELD, 0.005) + 0.0012
-    flown = np.clip(time - BEGIN - lag, 0, TRAVEL) * SPEED
+    flown = np.clip(time - LEAD - BEGIN - lag, 0, MOVING) * SPEED
     after = np.where(time >= BEGIN + TRAVEL, end_error(time - BEGIN - TRAVEL), 0.0)
     still = np.tile([0.0, 0.0, 0.0, 1.0], (len(due), 1))
     last = BEGIN + TRAVEL + hover + 0.005  # s, when the pilot goes from streaming to holding
@@ -48,7 +55,7 @@ def straight_flight(
             np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1)),
         ),
         estimates=columns.Estimates(
-            due, np.zeros((len(due), 3)), np.tile([0.3, 0.4, 0.0], (len(due), 1)), np.zeros((len(due), 3)), still
+            due + LEAD, np.zeros((len(due), 3)), np.tile([0.3, 0.4, 0.0], (len(due), 1)), np.zeros((len(due), 3)), still
         ),
         status=columns.StatusReports(
             due, np.tile([1.0, 2.0, 2.0], (len(due), 1)), np.zeros((len(due), 4), int), 4.0 - 0.1 * (due - BEGIN),
@@ -78,6 +85,40 @@ def test_the_rms_is_that_of_a_known_deviation(flight):
     along = deviation(straight_flight(flight.header, lag=0.2), BEGIN + 1, BEGIN + 3)
     np.testing.assert_allclose(along.in_time, 0.1, atol=1e-9)
     assert summarise(straight_flight(flight.header, lag=0.2)).rms_deviation == pytest.approx(0.1, rel=0.03)
+
+
+@pytest.mark.parametrize("shifted", [False, True], ids=["plain", "corrected"])
+def test_a_vehicle_that_flies_its_plan_as_planned_does_not_deviate(flight, make_profile, shifted):
+    """By the plan's own motion, and the packets that are sent for it: they round to 1 mm."""
+    path = min_snap([[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]])
+    plan = asked = Trajectory(path, make_profile(path.end, np.full(30, 1.5)), AIRFRAMES["crazyflie-2.1+"])
+    assert np.linalg.norm(plan.at(np.linspace(0.0, plan.duration, 300)).velocity, axis=1).max() > 1.9
+    if shifted:
+        asked = corrected(plan, PlanCorrection(np.random.default_rng(1).normal(0.0, 0.05, (8, 3)), plan.duration))
+    sent = encode_trajectory(asked)
+    due = BEGIN + sent.times
+    time = np.arange(BEGIN - 0.5, due[-1], 0.01) + 0.0037
+    where = plan.at(np.clip(time - BEGIN, 0.0, plan.duration)).position
+    made_up = straight_flight(flight.header)
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
+    motion = sent.decoded
+    record = dataclasses.replace(
+        made_up,
+        header=dataclasses.replace(
+            flight.header, travel_time=plan.duration, path=path(np.linspace(0.0, path.end, 500)),
+            shift=asked.at(sent.times + LEAD).position - plan.at(sent.times + LEAD).position if shifted else [],
+        ),
+        setpoints=columns.Setpoints(
+            due + 0.001, due, np.arange(len(due)), motion.position, motion.velocity, motion.acceleration,
+            motion.quaternion, motion.body_rate,
+        ),
+        poses=columns.Poses(time, time + 0.01, where, still),
+        phases=columns.Phases(np.array([BEGIN - 0.1, due[-1] + 0.002]), np.array(["stream", "hold"])),
+    )  # fmt: skip
+    summary = summarise(record)
+    assert summary.max_deviation < 0.0015
+    assert summary.max_deviation_to_path < 0.001
+    assert summary.travel_time_flown == pytest.approx(plan.duration, abs=0.005)
 
 
 def test_a_perfect_flight_takes_its_planned_time(flight):
@@ -149,13 +190,13 @@ def test_peaks_lateness_and_battery_are_those_of_the_streams(flight):
     assert summary.peak_body_rate == pytest.approx(3.0)
     assert summary.lateness_p50 == pytest.approx(0.001)
     assert summary.battery_start == pytest.approx(4.0)
-    assert summary.battery_end == pytest.approx(4.0 - 0.1 * (TRAVEL + HELD))
+    assert summary.battery_end == pytest.approx(4.0 - 0.1 * (MOVING + HELD))
 
 
 @pytest.mark.parametrize(("lag", "share"), [(0.0, -0.05), (0.1, -0.05), (0.0, 0.02)])
 def test_a_vehicle_that_believes_itself_slower_than_its_poses_are_says_so(flight, lag, share):
     record = straight_flight(flight.header, lag=lag)
-    moving = (record.estimates.time > BEGIN + lag) & (record.estimates.time < BEGIN + lag + TRAVEL)
+    moving = (record.estimates.time > BEGIN + LEAD + lag) & (record.estimates.time < BEGIN + TRAVEL + lag)
     velocity = np.where(moving[:, None], [(1.0 + share) * SPEED, 0.0, 0.0], 0.0)
     believed = dataclasses.replace(record, estimates=dataclasses.replace(record.estimates, velocity=velocity))
     found = summarise(believed).estimated_speed

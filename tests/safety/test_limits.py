@@ -138,7 +138,7 @@ def test_unknown_keys_are_errors(tmp_path, place):
         ({"plan.specific_thrust": 9.9}, "cannot hover"),
         ({"plan.motor_reserve": 0.1, "plan.tilt_deg": 50}, "cannot hold its height beyond a tilt of 44"),
         ({"plan.motor_reserve": 0.1, "plan.acceleration": 9.8}, "cannot accelerate at more than 9.6"),
-        ({"plan.speed": 20.0, "flight.speed": {"brake": 25, "land": 28, "cut": 32}}, "cannot fly faster than 17.8"),
+        ({"plan.speed": 20.0, "flight.speed": {"brake": 25, "land": 28, "cut": 32}}, r"cannot fly faster than 1\d\.\d"),
         ({"plan.angular_acceleration": 900.0}, r"cannot turn faster by more than \d+ rad"),
         ({"plan.tilt_deg": 36}, r"plan.tilt_deg \(36°\) is above flight.stop_tilt_deg \(35°\)"),
         ({"plan.tilt_deg": 34, "flight.stop_tilt_deg": 33}, r"is above flight.stop_tilt_deg \(33°\)"),

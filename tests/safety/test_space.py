@@ -138,8 +138,8 @@ def test_a_box_about_a_place_is_at_most_as_far_from_an_obstacle_as_its_nearest_p
 def test_a_path_among_obstacles_is_refused_exactly_where_a_far_finer_grid_finds_it_too_near(obstacles, points):
     if np.linalg.norm(np.diff(points, axis=0), axis=1).min() < 0.02:
         return
-    path = min_snap(points)
-    space = Space((-9.0, -9.0, -9.0), (9.0, 9.0, 9.0), 0.1, tuple(obstacles))
+    path = min_snap(points)  # which swings far out where points are close together
+    space = Space((-999.0, -999.0, -999.0), (999.0, 999.0, 999.0), 0.1, tuple(obstacles))
     s, beyond = distances_beyond(path, space)
     fine = np.linspace(0.0, path.end, 20001)
     seen = space.beyond(path(fine)).max(axis=1)

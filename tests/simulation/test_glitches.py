@@ -14,9 +14,9 @@ from cfplan.simulation.engine.flight import fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.glitches import (
     AFTERWARDS,
+    CRITICAL_USAGE,
     GAP,
     KINDS,
-    NEARLY,
     TURNED_OVER,
     WITHOUT_POSES_EVERY,
     glitch_at_every_setpoint,
@@ -118,7 +118,7 @@ def test_sampled_gaps_say_the_same_where_the_vehicle_is_nearly_lost_and_little_l
     cut = found.deviation.max() / 0.9  # then some are nearly lost
     strict = replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=cut)))
     sampled = glitch_at_sampled_setpoints(line, strict)
-    nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > NEARLY + 0.15).any(axis=0)
+    nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > CRITICAL_USAGE + 0.15).any(axis=0)
     assert 0 < np.count_nonzero(nearly) < len(line)
     np.testing.assert_array_equal(sampled.deviation[:, nearly], found.deviation[:, nearly])
     np.testing.assert_array_equal(sampled.tilt[:, nearly], found.tilt[:, nearly])

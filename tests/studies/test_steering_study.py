@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cfplan.air.requests import Wish
+from cfplan.air.requests import PathVerdict, Wish
 from cfplan.air.stepped import PlannerFault
 from cfplan.flight.setpoints.packets import decode
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -100,8 +100,14 @@ def test_what_is_flown_later_than_proposed_is_judged_as_it_is_flown(limits):
         vehicle.wait()
         vehicle.sleep(1.0)
         flight.planner.fault = PlannerFault.OTHER_JOINT
-        vehicle.request(Wish.REPLACE, [[1.0, 1.0, 1.2]])
+        accepted = vehicle.request(Wish.REPLACE, [[1.0, 1.0, 1.2]])
         vehicle.sleep(1.5)
+        flight.planner.fault = None
+        answers = [*vehicle.answers(), vehicle.answer_to(vehicle.request(Wish.REPLACE, [[0.0, 0.5, 1.0]]))]
         vehicle.land()
     assert [each.later for each in flight.commitments][-1] == 3
     assert judge_sequence(flight.sent, flight.commitments, limits).faults == ()
+    # The planner does not know what the pilot is committed to: it answers each request once, and leaves none pending.
+    assert [answer.verdict for answer in answers] == [PathVerdict.REFUSED] * 2
+    assert flight.answered[accepted] == 1
+    assert flight.planner.pending == frozenset()

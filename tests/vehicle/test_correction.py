@@ -12,7 +12,7 @@ from cfplan.vehicle.correction import PlanCorrection, corrected, fit_correction
 from cfplan.vehicle.trajectory import Trajectory
 
 WAYPOINTS = [[0, 0, 1], [1.5, 1, 1.4], [1, -1.5, 0.6], [-1, 0.5, 1.2]]
-NEARLY = {"position": 1e-7, "velocity": 1e-5, "acceleration": 1e-3, "jerk": 0.1}  # shifts are made of polynomials
+TOLERANCES = {"position": 1e-7, "velocity": 1e-5, "acceleration": 1e-3, "jerk": 0.1}  # shifts are made of polynomials
 
 
 def broken_beside(path: Path, s: np.ndarray) -> Path:
@@ -36,10 +36,10 @@ def correction(trajectory):
     return PlanCorrection(np.random.default_rng(4).uniform(-0.05, 0.05, (count, 3)), trajectory.duration)
 
 
-@pytest.mark.parametrize("order", range(len(NEARLY)))
+@pytest.mark.parametrize("order", range(len(TOLERANCES)))
 def test_each_derivative_is_that_of_the_trajectory_and_that_of_the_shift(trajectory, correction, order):
     times = np.random.default_rng(5).uniform(0.0, trajectory.duration, 500)
-    name, off = list(NEARLY.items())[order]
+    name, off = list(TOLERANCES.items())[order]
     found = getattr(corrected(trajectory, correction).at(times), name)
     expected = getattr(trajectory.at(times), name) + correction.at(times)[:, order]
     np.testing.assert_allclose(found, expected, rtol=0.0, atol=off)

@@ -8,9 +8,9 @@ its numbers were seen to count at it.
 
 import math
 
-_PROOF = 1.0  # s; over two of these the frame numbers must count at the announced rate
+_RATE_CHECK_PERIOD = 1.0  # s; over two of these the frame numbers must count at the announced rate
 _DRIFT = 5e-4  # relative difference of the two clocks; the earliest arrival is forgotten at this rate
-_TOLERANCE = _DRIFT  # relative error of that rate, from the earliest arrivals of both proofs
+_RATE_TOLERANCE = _DRIFT  # relative error of that rate, from the earliest arrivals of both proofs
 
 
 class FrameClock:
@@ -24,15 +24,15 @@ class FrameClock:
         self._number: int | None = None
         self._rate = math.nan
         # s, the earliest arrival in the first and in the second time of proof; None once the rate is proven
-        self._proof: list[float] | None = None
-        self._proof_begin = math.nan
+        self._earliest_of_halves: list[float] | None = None
+        self._check_begin = math.nan
         # s, when number 0 came, according to the earliest arrivals; the last arrival
         self._earliest = self._heard = math.inf
 
     @property
     def sure(self) -> bool:
         """Return whether delays are recognised."""
-        return self._number is not None and self._proof is None
+        return self._number is not None and self._earliest_of_halves is None
 
     def taken(self, received: float, number: int | None, rate: float, latency: float = math.nan) -> float:
         """Return when the frame was taken, s. `latency`, s, is the system's own figure; the larger one counts."""
@@ -45,22 +45,22 @@ class FrameClock:
         start = received - number / rate
         self._earliest = min(self._earliest + _DRIFT * max(received - self._heard, 0.0), start)
         self._heard = received
-        if self._proof is not None and not self._proven(received, start):
+        if self._earliest_of_halves is not None and not self._rate_confirmed(received, start):
             return received - behind
         return self._earliest + number / rate - behind
 
     def _begin(self, received: float) -> None:
-        self._proof, self._proof_begin = [math.inf, math.inf], received
+        self._earliest_of_halves, self._check_begin = [math.inf, math.inf], received
         self._earliest, self._heard = math.inf, received
 
-    def _proven(self, received: float, start: float) -> bool:
-        assert self._proof is not None
-        half = int((received - self._proof_begin) / _PROOF)
+    def _rate_confirmed(self, received: float, start: float) -> bool:
+        assert self._earliest_of_halves is not None
+        half = int((received - self._check_begin) / _RATE_CHECK_PERIOD)
         if half < 2:
-            self._proof[half] = min(self._proof[half], start)
+            self._earliest_of_halves[half] = min(self._earliest_of_halves[half], start)
             return False
-        if not abs(self._proof[1] - self._proof[0]) < _TOLERANCE * _PROOF:
+        if not abs(self._earliest_of_halves[1] - self._earliest_of_halves[0]) < _RATE_TOLERANCE * _RATE_CHECK_PERIOD:
             self._begin(received)
             return False
-        self._proof = None
+        self._earliest_of_halves = None
         return True

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cfplan.flight.telemetry import Estimate, Quaternion, Triple, VehicleStatus
 from cfplan.vehicle.rotations import product
 
-_REACH = 1.5  # s of the log that are kept, more than a pose that is sent may be old (`pose.age_brake` is at most 1 s)
+_HISTORY = 1.5  # s of the log that are kept, more than a pose that is sent may be old (`pose.age_brake` is at most 1 s)
 _LONGEST_GAP = 0.1  # s between two messages of the log, beyond which the motion between them is unknown
 
 _Samples = deque[tuple[float, Triple]]
@@ -71,7 +71,7 @@ class SensedMotion:
 def _append(samples: _Samples, time: float, value: Triple) -> None:
     if not samples or time > samples[-1][0]:
         samples.append((time, value))
-        while time - samples[0][0] > _REACH:
+        while time - samples[0][0] > _HISTORY:
             samples.popleft()
 
 

@@ -1,11 +1,11 @@
 """Check of a tracked body's poses, one by one: good, occluded, repeated, frozen, jumped, flipped, astray or broken.
 
-A pose is compared with where the last good ones led. A pose that jumps away and stays away is rejected for longer than
-a landing takes: tracking that took another body, or turned the marker pattern over, looks exactly like that, and a
-vehicle in the air is better off with no pose.
+A pose is compared with the extrapolation of the last good ones. A pose that jumps away and stays away is rejected for
+longer than a landing takes: it may be another body, or a marker pattern that tracking fits upside down, and in the air
+no pose is safer than a wrong one.
 
-In flight the vehicle's own estimate is the second witness. Its attitude tells a vehicle that turned while it was hidden
-from a marker pattern that was turned over; after a gap, its position tells a vehicle that flew on from a jump.
+In flight a pose is also compared with the vehicle's own estimate. Its attitude tells a vehicle that turned while it was
+hidden from a flipped marker pattern; after a gap, its position tells a vehicle that flew on from a jump.
 """
 
 import math
@@ -15,21 +15,21 @@ from typing import Protocol
 
 from cfplan.flight.telemetry import Quaternion, Triple
 
-_NORM_TOLERANCE = 0.01  # by which the norm of a quaternion may differ from 1
-_TURN = 0.5  # rad from one pose to the next, however short the time between them
+_NORM_TOLERANCE = 0.01  # on the norm of a quaternion, which must be 1
+_MAX_TURN_PER_FRAME = 0.5  # rad from one pose to the next, at any frame rate
 
 # Against the track. A marker pattern that is seen the wrong way round turns by 90° or 180°.
-_SPEED, _TURN_RATE, _LARGEST_TURN = 4.0, 12.0, 1.3  # m/s, rad/s, rad however long the time
-_ACCELERATION = 20.0  # m/s² by which the motion may have changed since the last good pose; twice what a flight may do
-_ATTITUDE_LASTS = 0.2  # s; after a longer gap the vehicle's own attitude is better than that of its last pose
-_HISTORY = 0.1  # s of good poses from which the velocity is taken
-_EXTRAPOLATE = 0.3  # s for which that velocity is taken to last
+_TRACK_SPEED, _TRACK_TURN_RATE, _MAX_TRACK_TURN = 4.0, 12.0, 1.3  # m/s, rad/s; rad after any gap
+_TRACK_ACCELERATION = 20.0  # m/s², largest acceleration since the last good pose; twice what a flight may reach
+_ATTITUDE_TIMEOUT = 0.2  # s; after a longer gap a pose is compared with the estimated attitude
+_HISTORY = 0.1  # s of good poses, from which the velocity is computed
+_MAX_EXTRAPOLATION = 0.3  # s, largest extrapolation with that velocity
 _SWITCH_AFTER = 30.0  # s that another track must last; no landing takes that long
 
 # Against the vehicle: beyond what it can do, and where it cannot be by its own estimate.
 _VEHICLE_SPEED, _VEHICLE_TURN_RATE = 6.0, 25.0  # m/s, rad/s
-_GAP = 0.1  # s without a good pose, after which the vehicle's own estimate tells where the next one must be
-_DRIFT = 0.5  # m/s², by which that estimate may go wrong meanwhile
+_MIN_GAP = 0.1  # s without a good pose, after which the next one must agree with the vehicle's estimate
+_ESTIMATE_DRIFT = 0.5  # m/s², largest error of that estimate's acceleration meanwhile
 
 
 class Placed(Protocol):
@@ -43,7 +43,7 @@ class Placed(Protocol):
 
 
 class Verdict(StrEnum):
-    """What a pose is; only a good one may be used."""
+    """Verdict on a pose; only a good one is used."""
 
     GOOD = "good"
     OCCLUDED = "occluded"
@@ -110,12 +110,12 @@ class PoseCheck:
     def _against_track(self, time: float, body: Placed) -> Verdict:
         last_time, last = self._track[-1]
         elapsed = time - last_time
-        off = math.dist(body.position, self._expected(time))
-        turned = _angle_between(body.quaternion, last.quaternion)
-        if self.attitude is not None and (turned > _TURN or elapsed > _ATTITUDE_LASTS):
-            turned = _angle_between(body.quaternion, self.attitude)
-            turned = turned if turned > _TURN else 0.0
-        if off <= self._jump and turned <= _TURN:
+        distance = math.dist(body.position, self._expected(time))
+        turn = _angle_between(body.quaternion, last.quaternion)
+        if self.attitude is not None and (turn > _MAX_TURN_PER_FRAME or elapsed > _ATTITUDE_TIMEOUT):
+            turn = _angle_between(body.quaternion, self.attitude)
+            turn = turn if turn > _MAX_TURN_PER_FRAME else 0.0
+        if distance <= self._jump and turn <= _MAX_TURN_PER_FRAME:
             self._other = None
             return Verdict.GOOD
         if self._other is not None and self._continues(*self._other, time, body):
@@ -125,9 +125,9 @@ class PoseCheck:
             self._other = None
             self._track.clear()
             return Verdict.GOOD
-        if off > self._jump + _ACCELERATION / 2 * elapsed**2:
+        if distance > self._jump + _TRACK_ACCELERATION / 2 * elapsed**2:
             verdict = Verdict.JUMPED
-        elif turned > (_TURN if self.attitude is not None else _turn_within(elapsed)):
+        elif turn > (_MAX_TURN_PER_FRAME if self.attitude is not None else _max_turn(elapsed)):
             verdict = Verdict.FLIPPED
         else:
             self._other = None
@@ -139,7 +139,7 @@ class PoseCheck:
         """Return where, m, the last good poses led."""
         (first_time, first), (last_time, last) = self._track[0], self._track[-1]
         span = last_time - first_time
-        ahead = min(time - last_time, _EXTRAPOLATE)
+        ahead = min(time - last_time, _MAX_EXTRAPOLATION)
         ratio = ahead / span if span >= _HISTORY / 5 else 0.0
         x, y, z = (b + (b - a) * ratio for a, b in zip(first.position, last.position, strict=True))
         return x, y, z
@@ -147,8 +147,8 @@ class PoseCheck:
     def _continues(self, other_time: float, other: Placed, time: float, body: Placed) -> bool:
         """Return whether a pose continues another track."""
         elapsed = time - other_time
-        near = math.dist(body.position, other.position) <= self._jump + _SPEED * elapsed
-        return near and _angle_between(body.quaternion, other.quaternion) <= _turn_within(elapsed)
+        near = math.dist(body.position, other.position) <= self._jump + _TRACK_SPEED * elapsed
+        return near and _angle_between(body.quaternion, other.quaternion) <= _max_turn(elapsed)
 
     def _against_vehicle(self, time: float, body: Placed, believed: Triple | None) -> Verdict:
         """Return whether the vehicle can have come here since the last confirmed pose."""
@@ -157,11 +157,11 @@ class PoseCheck:
             elapsed = time - last_time
             if math.dist(body.position, last.position) > self._jump + _VEHICLE_SPEED * elapsed:
                 return Verdict.JUMPED
-            if _angle_between(body.quaternion, last.quaternion) > _TURN + _VEHICLE_TURN_RATE * elapsed:
+            if _angle_between(body.quaternion, last.quaternion) > _MAX_TURN_PER_FRAME + _VEHICLE_TURN_RATE * elapsed:
                 return Verdict.FLIPPED
-            if believed is not None and elapsed >= _GAP:
-                off = math.dist(body.position, believed)
-                if off > self._jump + _DRIFT / 2.0 * elapsed**2:
+            if believed is not None and elapsed >= _MIN_GAP:
+                distance = math.dist(body.position, believed)
+                if distance > self._jump + _ESTIMATE_DRIFT / 2.0 * elapsed**2:
                     return Verdict.ASTRAY
         self._confirmed = time, body
         return Verdict.GOOD
@@ -179,6 +179,6 @@ def _angle_between(first: Quaternion, second: Quaternion) -> float:
     return 2.0 * math.acos(min(1.0, aligned))
 
 
-def _turn_within(elapsed: float) -> float:
+def _max_turn(elapsed: float) -> float:
     """Return the largest turn, rad, of a track after `elapsed`, s."""
-    return min(_TURN + _TURN_RATE * elapsed, _LARGEST_TURN)
+    return min(_MAX_TURN_PER_FRAME + _TRACK_TURN_RATE * elapsed, _MAX_TRACK_TURN)

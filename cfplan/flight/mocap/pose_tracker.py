@@ -27,14 +27,14 @@ from cfplan.flight.telemetry import Estimate, Quaternion, Triple, VehicleStatus
 from cfplan.safety.limits import PoseLimits
 
 MAX_EXTRAPOLATION = 0.05  # s that the line through the last poses is trusted beyond the last
-_LINE = 0.06  # s of poses that it is drawn through: 1 mm of noise gives 0.02 m/s at 100 Hz
-_FEWEST = 4  # poses that make a line
-_RECENT = 1.0  # s of good poses that are kept
-_FEWEST_HEIGHTS = 3  # that tell whether a body rests
+_FIT_WINDOW = 0.06  # s of poses that it is drawn through: 1 mm of noise gives 0.02 m/s at 100 Hz
+_MIN_FIT_POSES = 4  # poses that make a line
+_HISTORY = 1.0  # s of good poses that are kept
+_MIN_HEIGHTS = 3  # that tell whether a body rests
 _RATE_SLACK = 1.2  # times the expected rate may be used; more only burdens the record
 
-SMALLEST_STEP = 0.02  # m beside where the last poses led, which counts as a step; the filter makes 0.1 m/s of it
-_LET_IN = 0.1  # m/s
+SMALLEST_STEP = 0.02  # m from the extrapolated position; such a step shifts the filter's velocity by 0.1 m/s
+_STEP_FADE_SPEED = 0.1  # m/s
 _STEP_GAP = 0.1  # s without a good pose, after which a step is as likely the vehicle's
 
 VELOCITY_MISMATCH = 0.2
@@ -57,7 +57,7 @@ class PoseTracker:
         self._next = -math.inf  # s, before which a pose comes too soon
         self._line: deque[Pose] = deque()  # the last good poses, without their steps
         self._offset: Triple = (0.0, 0.0, 0.0)  # m, added to poses: a step that is kept from the vehicle
-        self._smoothed = -math.inf  # s, time of the last pose in flight
+        self._smoothed_until = -math.inf  # s, time of the last pose in flight
         self._unsent: Pose | None = None  # the newest good pose since `to_send`
         self._mismatch_since = math.inf  # s, since when the velocities of poses and estimate have differed
         self.recent: deque[Pose] = deque()  # the good poses of the last second
@@ -99,7 +99,7 @@ class PoseTracker:
         period = 1.0 / (self._limits.rate * _RATE_SLACK)
         self._next = max(self._next, pose.time - period) + period
         if not self.fault:
-            self._use(pose)
+            self._accept(pose)
         return True
 
     def _believed(self, time: float) -> Triple | None:
@@ -111,36 +111,36 @@ class PoseTracker:
             return None
         return self._estimate.position_at(time)
 
-    def _use(self, pose: Pose) -> None:
-        self._line.append(self._without_step(pose) if self._airborne else pose)
-        while self._line[0].time < pose.time - _LINE:
+    def _accept(self, pose: Pose) -> None:
+        self._line.append(self._smooth_step(pose) if self._airborne else pose)
+        while self._line[0].time < pose.time - _FIT_WINDOW:
             self._line.popleft()
         self._unsent = pose
         self.recent.append(pose)
-        while self.recent[0].time < pose.time - _RECENT:
+        while self.recent[0].time < pose.time - _HISTORY:
             self.recent.popleft()
 
     # Steps.
 
-    def _without_step(self, pose: Pose) -> Pose:
-        elapsed, self._smoothed = pose.time - self._smoothed, pose.time
+    def _smooth_step(self, pose: Pose) -> Pose:
+        elapsed, self._smoothed_until = pose.time - self._smoothed_until, pose.time
         if elapsed > _STEP_GAP:
             self._offset, self.step = (0.0, 0.0, 0.0), 0.0
             return pose
         if self.step:
-            left = max(1.0 - _LET_IN * elapsed / math.hypot(*self._offset), 0.0)
+            left = max(1.0 - _STEP_FADE_SPEED * elapsed / math.hypot(*self._offset), 0.0)
             x, y, z = self._offset
             self._offset = left * x, left * y, left * z
-        led = self.position(pose.time)
-        off = math.dist(pose.position, led)
-        expected = led if off <= SMALLEST_STEP else self._reckoned(pose.time)  # then the sensors count, too
+        extrapolated = self.position(pose.time)
+        jump = math.dist(pose.position, extrapolated)
+        expected = extrapolated if jump <= SMALLEST_STEP else self._dead_reckoned(pose.time)
         if expected is not None and math.dist(_sum(pose.position, self._offset), expected) > SMALLEST_STEP:
-            x, y, z = (wanted - seen for wanted, seen in zip(expected, pose.position, strict=True))
+            x, y, z = (there - measured for there, measured in zip(expected, pose.position, strict=True))
             self._offset = x, y, z
             if math.hypot(x, y, z) > self._limits.jump:  # too far to be kept back
                 self._offset = (0.0, 0.0, 0.0)
                 self._line.clear()  # a line across the step would show a speed
-        self.step = (self.step or off) if any(self._offset) else 0.0
+        self.step = (self.step or jump) if any(self._offset) else 0.0
         return replace(pose, position=_sum(pose.position, self._offset)) if self.step else pose
 
     # Where the vehicle is.
@@ -155,25 +155,25 @@ class PoseTracker:
     @property
     def velocity(self) -> Triple:
         """Return the slope of that line, m/s; zero while there are too few poses."""
-        line = self._fitted()
+        line = self._line_fit()
         return line[1] if line is not None else (0.0, 0.0, 0.0)
 
-    def _fitted(self) -> tuple[float, Triple] | None:
+    def _line_fit(self) -> tuple[float, Triple] | None:
         """Return the time, s, in the middle of the line, and its slope, m/s; None while there are too few poses."""
         count = len(self._line)
-        if count < _FEWEST:
+        if count < _MIN_FIT_POSES:
             return None
         middle = sum([pose.time for pose in self._line]) / count
         spread = x = y = z = 0.0
         for pose in self._line:
-            off, (px, py, pz) = pose.time - middle, pose.position
-            spread += off**2
-            x, y, z = x + off * px, y + off * py, z + off * pz
+            offset, (px, py, pz) = pose.time - middle, pose.position
+            spread += offset**2
+            x, y, z = x + offset * px, y + offset * py, z + offset * pz
         return middle, (x / spread, y / spread, z / spread)
 
-    def _reckoned(self, now: float) -> Triple | None:
+    def _dead_reckoned(self, now: float) -> Triple | None:
         """Return the position, m, by the last good poses and what the sensors have measured since; None if unknown."""
-        line, last = self._fitted(), self._line[-1]
+        line, last = self._line_fit(), self._line[-1]
         way = self._sensed.displacement(line[1], line[0], last.time, now) if line is not None else None
         return _sum(last.position, way) if way is not None else None
 
@@ -187,13 +187,13 @@ class PoseTracker:
             return None
         if not self._airborne or now - newest.time <= MAX_EXTRAPOLATION:
             return self.position(now), newest.quaternion
-        position, turned = self._reckoned(now), self._sensed.turn(newest.quaternion, newest.time, now)
+        position, turned = self._dead_reckoned(now), self._sensed.turn(newest.quaternion, newest.time, now)
         return None if position is None or turned is None else (position, turned)
 
     def heights(self, since: float) -> list[float]:
         """Return the heights, m, of the good poses after a time, s; none if they do not reach back as far."""
         heights = [pose.position[2] for pose in self.recent if pose.time > since]
-        return heights if len(heights) >= _FEWEST_HEIGHTS and self.recent[0].time <= since else []
+        return heights if len(heights) >= _MIN_HEIGHTS and self.recent[0].time <= since else []
 
     # Distrust.
 
@@ -203,14 +203,14 @@ class PoseTracker:
         Only `slow` flight counts, where little else explains a difference. On the floor, the body's yaw cannot be
         observed.
         """
-        off, line = 0.0, self._fitted()
+        mismatch, line = 0.0, self._line_fit()
         if slow and self._estimate is not None and line and now - self.recent[-1].time <= self._limits.age_warning:
-            off = math.dist(line[1][:2], self._estimate.velocity_at(line[0])[:2])
-        self._mismatch_since = min(self._mismatch_since, now) if off > VELOCITY_MISMATCH else math.inf
+            mismatch = math.dist(line[1][:2], self._estimate.velocity_at(line[0])[:2])
+        self._mismatch_since = min(self._mismatch_since, now) if mismatch > VELOCITY_MISMATCH else math.inf
         if now - self._mismatch_since >= patience and not self.distrusted:
             self.distrusted = (
-                f"the tracked body moves by {off:.2f} m/s otherwise than the vehicle believes: "
-                "are its axes the vehicle's?"
+                f"velocities of the tracked body and of the vehicle's estimate differ by {mismatch:.2f} m/s: "
+                "do their axes agree?"
             )
 
 

@@ -14,14 +14,14 @@ from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn, parse_uri
 from cfplan.safety.limits import PoseLimits
 
-OPEN_WITHIN = 3.5  # s to see the first good poses
+OPEN_TIMEOUT = 3.5  # s to see the first good poses
 _FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
 _LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
 _READ_PERIOD = 0.005  # s between looks for them
-_ENOUGH = 5  # good poses that prove a body
+_MIN_GOOD_POSES = 5  # good poses that prove a body
 
 
-def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_WITHIN) -> "MocapSource":
+def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_TIMEOUT) -> "MocapSource":
     """Return a source of the poses of the body that a URI names. Raises InputError if the URI is wrong."""
     return MocapSource(parse_uri(uri, subject_needed=True), limits, open_within=open_within)
 
@@ -38,7 +38,7 @@ class MocapSource:
         uri: MocapUri,
         limits: PoseLimits,
         *,
-        open_within: float = OPEN_WITHIN,
+        open_within: float = OPEN_TIMEOUT,
         clock: Clock = REAL_CLOCK,
         make_feed: Callable[[MocapUri], Feed] = Feed,
     ):
@@ -71,12 +71,12 @@ class MocapSource:
         self._feed = self._make_feed(self._uri)
         try:
             self._feed.start()
-            while check.counts[Verdict.GOOD] < _ENOUGH:
-                self._look(check)
+            while check.counts[Verdict.GOOD] < _MIN_GOOD_POSES:
+                self._judge_new_poses(check)
                 self._check_subject()
                 failure = self._feed.failure()
                 if failure is not None:
-                    self._look(check)  # its last words say more
+                    self._judge_new_poses(check)  # its last words say more
                     raise failure
                 if self._clock.now() > deadline:
                     raise self._nothing_came(check)
@@ -127,7 +127,7 @@ class MocapSource:
         self.fault, body = "", frame.bodies[0]
         return Pose(taken, frame.received, body.position, body.quaternion, frame.number)
 
-    def _look(self, check: PoseCheck) -> None:
+    def _judge_new_poses(self, check: PoseCheck) -> None:
         """Read poses for the first call of `poses`, and check that they are upright and in metres."""
         for pose in self._read():
             self._first.append(pose)

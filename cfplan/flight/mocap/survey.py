@@ -16,7 +16,7 @@ from cfplan.flight.mocap.uri import MocapUri, no_such_body, nothing_by_vrpn
 from cfplan.flight.telemetry import Triple
 from cfplan.vehicle.rotations import tilt_of, yaw_of
 
-FIRST_FRAME_WITHIN = 3.5  # s
+FIRST_FRAME_TIMEOUT = 3.5  # s
 _JUMP = 0.15  # m
 _DROPOUT = 1.5  # periods between frames; one is missing where it takes longer
 _READ_PERIOD = 0.005  # s
@@ -163,7 +163,7 @@ def survey(
     surveyor, shown = Surveyor(), 0.0
     with make_feed(replace(uri, subject="")) as feed:
         feed.start()
-        end = clock.now() + FIRST_FRAME_WITHIN
+        end = clock.now() + FIRST_FRAME_TIMEOUT
         while clock.now() < end:
             for message in feed.messages():
                 if isinstance(message, CfplanError):
@@ -183,7 +183,7 @@ def survey(
             clock.sleep(_READ_PERIOD)
         if not surveyor.frames:
             hint = "is the system live and streaming?"
-            raise LinkError(f"no frame within {FIRST_FRAME_WITHIN:g} s ({feed.stage})", where=str(uri), hint=hint)
+            raise LinkError(f"no frame within {FIRST_FRAME_TIMEOUT:g} s ({feed.stage})", where=str(uri), hint=hint)
     found = surveyor.report()
     if uri.system == "vrpn" and not found.bodies:
         raise nothing_by_vrpn(uri, found.seconds)

@@ -33,8 +33,8 @@ from cfplan.vehicle.trajectory import Trajectory
 
 FARTHEST = 0.02  # m from the reference
 SLOWEST = 1.5  # times the plan's duration
-_SHARES = (0.25, 0.5, 0.75, 1.0)  # of the pieces that there may be, that are tried
-_AS_FAST = 1.01  # times the least duration, within which the nearest to the plan is preferred
+_COUNT_FRACTIONS = (0.25, 0.5, 0.75, 1.0)  # of the pieces that there may be, that are tried
+_DURATION_TOLERANCE = 1.01  # times the least duration, within which the nearest to the plan is preferred
 _LENGTHS = (
     1.2,
     1.0,
@@ -45,11 +45,14 @@ _LENGTHS = (
     0.5,
     0.4,
 )  # s of a compressed piece, about: shorter ones suffer from whole millimetres
-_NEAR_FULL = 2  # pieces fewer than those that fill the memory: a few more or less fit better or worse
-_MOST_SOUGHT, _SOUGHT_STEP = 3.0, 0.05  # times as many pieces as there may be, that are sought for how long may fly
+_COUNTS_NEAR_FULL = 2  # pieces fewer than those that fill the memory: a few more or less fit better or worse
+_MAX_COUNT_FACTOR, _COUNT_FACTOR_STEP = (
+    3.0,
+    0.05,
+)  # times as many pieces as there may be, that are sought for how long may fly
 _COARSE = 0.004  # s between samples while the slowing is searched for
 _HALVINGS = 7
-_NUDGE, _TRIES = 1.003, 6  # where the fine certificate does not pass at what the coarse one found
+_SLOWING_STEP, _SLOWING_ATTEMPTS = 1.003, 6  # where the fine certificate does not pass at what the coarse one found
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +73,13 @@ class OnBoardTrajectory:
 
 
 @dataclass(frozen=True, slots=True)
-class _Made:
+class _Fitted:
     memory: bytes
     compressed: bool
     pieces: Pieces
 
 
-_Maker = Callable[[PolynomialReference], _Made]
+_Fit = Callable[[PolynomialReference], _Fitted]
 
 
 def certified_pieces(
@@ -94,20 +97,20 @@ def certified_pieces(
     what they are to be, or take longer than SLOWEST times as long.
     """
 
-    def maker(knots_of: Callable[[PolynomialReference, int], NDArray], count: int) -> _Maker:
-        def make(reference: PolynomialReference) -> _Made:
+    def fit_of(knots_of: Callable[[PolynomialReference, int], NDArray], count: int) -> _Fit:
+        def make(reference: PolynomialReference) -> _Fitted:
             pieces = fit_pieces(reference, knots_of(reference, count))
             if count > MOST_PIECES:
-                return _Made(b"", False, pieces)
+                return _Fitted(b"", False, pieces)
             memory = raw_bytes(pieces)
-            return _Made(memory, False, read_raw(memory, count))
+            return _Fitted(memory, False, read_raw(memory, count))
 
         return make
 
-    counts = sorted({max(1, round(most * share)) for share in _SHARES})
-    makers = (maker(knots_of, count) for count in counts for knots_of in (even_knots, drawn_knots))
+    counts = sorted({max(1, round(most * share)) for share in _COUNT_FRACTIONS})
+    fits_tried = (fit_of(knots_of, count) for count in counts for knots_of in (even_knots, drawn_knots))
     reference = PolynomialReference(trajectory, leads=leads, correction=correction)
-    return _best(makers, reference, limits, f"{most} pieces")
+    return _best(fits_tried, reference, limits, f"{most} pieces")
 
 
 def certified_compressed(
@@ -123,19 +126,21 @@ def certified_compressed(
     Raises NotCertifiedError as above; for a flight too long for the room with what would fit.
     """
 
-    def maker(count: int) -> _Maker:
+    def fit_of(count: int) -> _Fit:
         return lambda reference: _compressed(reference, count, room)
 
     reference = PolynomialReference(trajectory, leads=leads, correction=correction)
     counts = {max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS}
-    fullest = _fullest(reference, max(counts), room)
+    fullest = _max_count_that_fits(reference, max(counts), room)
     if fullest == max(counts):
-        return _best(map(maker, sorted(counts)), reference, limits, f"{room} bytes")
-    counts = {count for count in counts if count < fullest} | set(range(max(fullest - _NEAR_FULL, 1), fullest + 1))
+        return _best(map(fit_of, sorted(counts)), reference, limits, f"{room} bytes")
+    counts = {count for count in counts if count < fullest} | set(
+        range(max(fullest - _COUNTS_NEAR_FULL, 1), fullest + 1)
+    )
     try:
-        return _best(map(maker, sorted(counts)), reference, limits, f"{room} bytes")
+        return _best(map(fit_of, sorted(counts)), reference, limits, f"{room} bytes")
     except NotCertifiedError as error:
-        if fits := _longest(reference, fullest, room):
+        if fits := _longest_flight_that_fits(reference, fullest, room):
             raise NotCertifiedError(
                 f"a flight of {reference.duration:.0f} s; of one like this {room} bytes hold some {fits:.0f} s",
                 where="trajectory memory",
@@ -145,40 +150,40 @@ def certified_compressed(
         raise
 
 
-def _compressed(reference: PolynomialReference, count: int, room: int) -> _Made:
+def _compressed(reference: PolynomialReference, count: int, room: int) -> _Fitted:
     memory = compressed_bytes(fit_control_points(reference, count), room)
-    return _Made(memory, True, read_compressed(memory))
+    return _Fitted(memory, True, read_compressed(memory))
 
 
-def _fullest(reference: PolynomialReference, count: int, room: int) -> int:
+def _max_count_that_fits(reference: PolynomialReference, count: int, room: int) -> int:
     """Return the most compressed pieces, at most `count`, that `room` bytes hold."""
     while count > 1 and (size := compressed_size(fit_control_points(reference, count).moves)) > room:
-        count = max(min(count - 1, int(count * room / size) + _NEAR_FULL), 1)
+        count = max(min(count - 1, int(count * room / size) + _COUNTS_NEAR_FULL), 1)
     return count
 
 
-def _longest(reference: PolynomialReference, count: int, room: int) -> float:
+def _longest_flight_that_fits(reference: PolynomialReference, count: int, room: int) -> float:
     """Return how long, s, a flight like this may be for pieces that are near enough to fit; 0 where that is no matter
     of room: `count` pieces do.
     """
-    for share in np.arange(1.0, _MOST_SOUGHT, _SOUGHT_STEP):
+    for share in np.arange(1.0, _MAX_COUNT_FACTOR, _COUNT_FACTOR_STEP):
         made = _compressed(reference, round(share * count), sys.maxsize)
         if _error(made.pieces, reference) <= FARTHEST:
             return reference.duration * room / len(made.memory) if share > 1.0 else 0.0
     return 0.0
 
 
-def _best(makers: Iterable[_Maker], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:
+def _best(fits_tried: Iterable[_Fit], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:
     """Return the nearest to the reference among the fastest that pass. Raises NotCertifiedError where none does."""
     good: list[OnBoardTrajectory] = []
     flaws: list[tuple[float, str]] = []  # how bad, and what
-    for make in makers:
+    for make in fits_tried:
         try:
             made = _certified(make, reference, limits)
         except NotCertifiedError as error:
             flaws.append((np.inf, error.what))
             continue
-        if flaw := _flaw(made):
+        if flaw := _rejection(made):
             flaws.append((max(made.error / FARTHEST, made.certificate.worst.share), flaw))
         else:
             good.append(made)
@@ -188,20 +193,22 @@ def _best(makers: Iterable[_Maker], reference: PolynomialReference, limits: Limi
             hint="use more pieces, compressed ones if need be, or plan with lower limits",
         )  # fmt: skip
     least = min(made.duration for made in good)
-    return min((made for made in good if made.duration <= _AS_FAST * least), key=lambda made: made.error)
+    return min((made for made in good if made.duration <= _DURATION_TOLERANCE * least), key=lambda made: made.error)
 
 
-def _certified(make: _Maker, reference: PolynomialReference, limits: Limits) -> OnBoardTrajectory:
+def _certified(make: _Fit, reference: PolynomialReference, limits: Limits) -> OnBoardTrajectory:
     """Return what is made at about the least slowing at which its certificate passes, if it does at all."""
     samples = sample_pieces(make(reference).pieces, _COARSE)
-    slowing = _least(lambda factor: certify_samples(samples.slowed(factor), limits.airframe, limits.plan).passed)
-    for _ in range(_TRIES):
+    slowing = _least_slowing(
+        lambda factor: certify_samples(samples.slowed(factor), limits.airframe, limits.plan).passed
+    )
+    for _ in range(_SLOWING_ATTEMPTS):
         slowed = replace(reference, slowing=slowing)
         made = make(slowed)
         certificate = certify_pieces(made.pieces, limits.airframe, limits.plan, limits.space)
         if certificate.passed:
             break
-        slowing *= _NUDGE
+        slowing *= _SLOWING_STEP
     return OnBoardTrajectory(
         made.memory, made.compressed, made.pieces, certificate, slowed, _error(made.pieces, slowed)
     )
@@ -210,11 +217,11 @@ def _certified(make: _Maker, reference: PolynomialReference, limits: Limits) -> 
 def _error(pieces: Pieces, reference: PolynomialReference) -> float:
     """Return the farthest that pieces are from their reference, m."""
     samples = sample_pieces(pieces, _COARSE)
-    off = samples.derivatives[:, 0, :3] - reference.at(samples.time)[:, 0, :3]
-    return float(np.linalg.norm(off, axis=1).max())
+    deviation = samples.derivatives[:, 0, :3] - reference.at(samples.time)[:, 0, :3]
+    return float(np.linalg.norm(deviation, axis=1).max())
 
 
-def _flaw(made: OnBoardTrajectory) -> str:
+def _rejection(made: OnBoardTrajectory) -> str:
     """Return why a trajectory may not fly; empty where it may."""
     if not made.error <= FARTHEST:
         return f"polynomials stray {made.error:.2f} m from the plan, {FARTHEST:g} m are allowed"
@@ -224,7 +231,7 @@ def _flaw(made: OnBoardTrajectory) -> str:
     return ""
 
 
-def _least(passes: Callable[[float], bool]) -> float:
+def _least_slowing(passes: Callable[[float], bool]) -> float:
     """Return the least factor from 1 to SLOWEST at which something passes, found by halving; SLOWEST where none is."""
     if passes(1.0):
         return 1.0

@@ -37,12 +37,12 @@ class Correction:
         return out
 
 
-def correct(times: NDArray, strayed: NDArray, duration: float) -> Correction:
+def correct(times: NDArray, deviation: NDArray, duration: float) -> Correction:
     """Return what takes back by how much the vehicle strayed, (N, 3) m at times, (N,) s, of a flight of `duration`, s,
     that flew without a correction.
     """
     rows = np.arange(0.0, duration, times[1] - times[0])
-    wanted = -np.stack([np.interp(rows + _LEAD, times, along) for along in strayed.T], axis=1)
+    wanted = -np.stack([np.interp(rows + _LEAD, times, along) for along in deviation.T], axis=1)
     inner = np.linspace(0.0, duration, max(int(duration / _SPACING), 1) + 1)
     knots = np.concatenate([np.zeros(_DEGREE), inner, np.full(_DEGREE, duration)])
     matrix = BSpline.design_matrix(rows, knots, _DEGREE)

@@ -108,8 +108,8 @@ class _Problem:
         fitted, out = self.fitted(), np.zeros(len(self.durations))
         for k, duration in enumerate(self.durations):
             for order, weight in _WEIGHTS.items():
-                off = _basis(self._places * duration, order) @ fitted[k, :3].T - self._motion[k, :, order]
-                out[k] += duration * weight**2 * float(self._weights @ (off**2).sum(axis=1))
+                shift = _basis(self._places * duration, order) @ fitted[k, :3].T - self._motion[k, :, order]
+                out[k] += duration * weight**2 * float(self._weights @ (shift**2).sum(axis=1))
         return np.sqrt(out)
 
     def whole_numbers(self) -> NDArray:
@@ -117,10 +117,10 @@ class _Problem:
         parts = []
         for targets, weights, axes in ((self._motion, _WEIGHTS, slice(0, 3)), (self._yaw, _YAW_WEIGHTS, slice(3, 4))):
             ends = np.round(self._ends[:, axes] / STEPS[axes])
-            parts.append(self._solve(targets / STEPS[axes], weights, ends, whole=True))
+            parts.append(self._solve(targets / STEPS[axes], weights, ends, integer=True))
         return np.concatenate(parts, axis=2)
 
-    def _solve(self, targets: NDArray, weights: dict[int, float], ends: NDArray, whole: bool = False) -> NDArray:
+    def _solve(self, targets: NDArray, weights: dict[int, float], ends: NDArray, integer: bool = False) -> NDArray:
         """Return what pieces have in common, (K + 1, 4, D), for targets (K, _POINTS, 5, D); as whole numbers of
         differences of control points, or as derivatives by time.
         """
@@ -128,7 +128,7 @@ class _Problem:
         size = ENDS * (count + 1)
         bands, right = np.zeros((2 * ENDS, size)), np.zeros((size, axes))  # upper bands, as LAPACK has them
         for k, duration in enumerate(self.durations):
-            scale = np.tile(_BEZIER if whole else duration ** np.arange(ENDS), 2)
+            scale = np.tile(_BEZIER if integer else duration ** np.arange(ENDS), 2)
             block, first = np.zeros((2 * ENDS, 2 * ENDS)), ENDS * k
             for order, weight in weights.items():
                 rows = _basis(self._places, order) @ _HERMITE * scale / duration**order
@@ -142,43 +142,43 @@ class _Problem:
         out = np.zeros((size, axes))
         out[0], out[-ENDS] = ends  # the rest of both ends is 0
         if count > 1:
-            out[ENDS:-ENDS] = _inner(bands, right, out, whole)
-        return out.reshape(count + 1, ENDS, axes).astype(np.int64 if whole else float)
+            out[ENDS:-ENDS] = _inner(bands, right, out, integer)
+        return out.reshape(count + 1, ENDS, axes).astype(np.int64 if integer else float)
 
 
-def _inner(bands: NDArray, right: NDArray, fixed: NDArray, whole: bool) -> NDArray:
+def _inner(bands: NDArray, right: NDArray, fixed: NDArray, integer: bool) -> NDArray:
     """Return the unknowns between the first and the last four, which are `fixed`."""
     size = len(right)
     pulled = right.copy()
-    for off in range(1, 2 * ENDS):
-        column = np.arange(off, size)
-        value = bands[2 * ENDS - 1 - off, off:][:, None]
-        pulled[column - off] -= value * np.where((column >= size - ENDS)[:, None], fixed[column], 0.0)
-        pulled[column] -= value * np.where((column - off < ENDS)[:, None], fixed[column - off], 0.0)
+    for shift in range(1, 2 * ENDS):
+        column = np.arange(shift, size)
+        value = bands[2 * ENDS - 1 - shift, shift:][:, None]
+        pulled[column - shift] -= value * np.where((column >= size - ENDS)[:, None], fixed[column], 0.0)
+        pulled[column] -= value * np.where((column - shift < ENDS)[:, None], fixed[column - shift], 0.0)
     width = min(2 * ENDS, size - 2 * ENDS)  # bands of what is left
     bands, pulled = bands[2 * ENDS - width :, ENDS:-ENDS].copy(), pulled[ENDS:-ENDS]
     scale = 1.0 / np.sqrt(bands[-1])
-    for off in range(width):
-        bands[width - 1 - off, :off] = 0.0
-        bands[width - 1 - off, off:] *= scale[off:] * scale[: len(scale) - off]
+    for shift in range(width):
+        bands[width - 1 - shift, :shift] = 0.0
+        bands[width - 1 - shift, shift:] *= scale[shift:] * scale[: len(scale) - shift]
     upper = cholesky_banded(bands)
     lower = np.zeros_like(upper)  # its transpose
-    for off in range(width):
-        lower[off, : len(scale) - off] = upper[width - 1 - off, off:]
+    for shift in range(width):
+        lower[shift, : len(scale) - shift] = upper[width - 1 - shift, shift:]
     halfway = solve_banded((width - 1, 0), lower, pulled * scale[:, None])
     exact = solve_banded((0, width - 1), upper, halfway) * scale[:, None]
-    return _rounded(exact, upper / scale) if whole else exact
+    return _rounded(exact, upper / scale) if integer else exact
 
 
 def _rounded(exact: NDArray, upper: NDArray) -> NDArray:
     """Return whole numbers near `exact`, (N, D), in the metric of an upper triangle's bands: the nearest plane's."""
-    out, off = np.zeros_like(exact), np.zeros_like(exact)
+    out, shift = np.zeros_like(exact), np.zeros_like(exact)
     last = len(upper) - 1
     for n in range(len(exact) - 1, -1, -1):
         behind = np.arange(n + 1, min(n + last, len(exact) - 1) + 1)
-        pull = upper[last - (behind - n), behind] @ off[behind] if len(behind) else 0.0
+        pull = upper[last - (behind - n), behind] @ shift[behind] if len(behind) else 0.0
         out[n] = np.round(exact[n] - pull / upper[last, n])
-        off[n] = out[n] - exact[n]
+        shift[n] = out[n] - exact[n]
     return out
 
 

@@ -2,8 +2,8 @@
 
 The commander asks for position, velocity and acceleration, and for the yaw at which the controller turns its x axis; so
 the attitude is that with z along the thrust and y along z × [cos yaw, sin yaw, 0]. Thrust, attitude, body rates and
-motor thrusts follow from the pieces' derivatives up to snap, drag included. Samples and the allowance for what lies
-between them are those of the certificate of trajectories.
+motor thrusts follow from the pieces' derivatives up to snap, drag and the moment by velocity included. Samples and the
+allowance for what lies between them are those of the certificate of trajectories.
 """
 
 import math
@@ -35,12 +35,12 @@ from cfplan.vehicle.measures import measures_of
 
 _ALLOWANCE = 2.0 / 8.0  # of the second difference, twice what is needed
 # What position, velocity, acceleration and jerk may jump by between two pieces: roundings of float32, and of the time.
-_JUMPS = np.array([1e-4, 1e-3, 0.01, 0.5])
+_JOINT_TOLERANCES = np.array([1e-4, 1e-3, 0.01, 0.5])
 _NAMES = ("position", "velocity", "acceleration", "jerk")
 _UNITS = ("m", "m/s", "m/s²", "m/s³")
 # m, m/s, m/s², rad/s, by which float32 may be off: time alone is, by 0.1 ms after a minute of pieces.
-_ARITHMETIC = np.array([5e-4, 1e-3, 0.01, 0.05])
-_BESIDE = 1e-4  # s
+_ROUNDING_TOLERANCES = np.array([5e-4, 1e-3, 0.01, 0.05])
+_JOINT_OFFSET = 1e-4  # s
 _STEP = 0.0101  # s between moments at which its arithmetic is looked at
 
 
@@ -122,11 +122,11 @@ def _margin(samples: Samples, rows: NDArray, quantity: Quantity, limit: float, u
     at = int(np.argmax(bounds)) + 1
     peak = float(bounds[at - 1]) if math.isfinite(bounds[at - 1]) else math.nan
     worst = float(quantity.value(quantity.side * peak))
-    share = share_of(quantity, worst, limit, unused)
+    ratio = share_of(quantity, worst, limit, unused)
     x, y, z = samples.derivatives[at, 0, :3].tolist()
     time = float(samples.time[at])
     return Margin(
-        quantity.name, quantity.unit, worst, limit, max(0.0, float(share)) if math.isfinite(worst) else math.nan,
+        quantity.name, quantity.unit, worst, limit, max(0.0, float(ratio)) if math.isfinite(worst) else math.nan,
         time, time, (x, y, z),
     )  # fmt: skip
 
@@ -171,7 +171,9 @@ def measures_along(samples: Samples, airframe: Airframe) -> NDArray:
 
     thrust = (size + (axial_drag - drag) * _dot(z, velocity))[:, 0]
     inertia = np.array(airframe.inertia)
-    torque = inertia * turning + np.cross(rate, inertia * rate)
+    about_x, about_y = airframe.velocity_moment
+    air = np.concatenate([about_x * _dot(y, velocity), -about_y * _dot(x, velocity), zero[:, None]], axis=1)
+    torque = inertia * turning + np.cross(rate, inertia * rate) - air
     motors = motor_thrusts(airframe, airframe.mass * thrust, (torque[:, 0], torque[:, 1], torque[:, 2]))
     return measures_of(
         velocity, acceleration, rate, z, thrust, angular_acceleration=turning, motor_thrust=np.stack(motors, axis=1)
@@ -193,8 +195,8 @@ def check_joints(pieces: Pieces) -> None:
         left = ends[k - 1][1] if k else ends[0][0] * [[1], [0], [0], [0]]
         right = ends[k][0] if k < len(ends) else ends[-1][1] * [[1], [0], [0], [0]]
         jump = np.abs(left - right).max(axis=1) * (moving if k in (0, len(ends)) else 1.0)
-        if not (jump <= _JUMPS).all():
-            order = int(np.argmax(jump / _JUMPS))
+        if not (jump <= _JOINT_TOLERANCES).all():
+            order = int(np.argmax(jump / _JOINT_TOLERANCES))
             raise NotCertifiedError(
                 f"{_NAMES[order]} jumps by {jump[order]:.3g} {_UNITS[order]}",
                 where=f"the pieces, where piece {k + 1} begins" if k < len(ends) else "the end of the last piece",
@@ -206,7 +208,7 @@ def check_arithmetic(pieces: Pieces) -> None:
     """Check that what the commander computes in float32 is what was certified. Raises NotCertifiedError."""
     times = np.arange(0.0, pieces.duration - _STEP, _STEP)  # at the very end float32 decides whether it has ended
     # Next to a joint it decides which piece is flown; by how much these differ there, check_joints() bounds.
-    times = times[np.abs(times[:, None] - pieces.begins[1:]).min(axis=1, initial=np.inf) > _BESIDE]
+    times = times[np.abs(times[:, None] - pieces.begins[1:]).min(axis=1, initial=np.inf) > _JOINT_OFFSET]
     exact = np.concatenate(
         [
             derivatives_of(pieces, k, times[(times >= begin) & (times < begin + duration)] - begin, 4)
@@ -215,14 +217,14 @@ def check_arithmetic(pieces: Pieces) -> None:
     )
     goals = goals_at(pieces, times)
     rates = body_rates(exact[:, 2, :3], exact[:, 3, :3], exact[:, 0, 3], exact[:, 1, 3])
-    off = [
+    difference = [
         goals.position - exact[:, 0, :3], goals.velocity - exact[:, 1, :3],
         goals.acceleration - exact[:, 2, :3], goals.body_rate - rates,
     ]  # fmt: skip
-    share = (np.abs(off) / _ARITHMETIC[:, None, None]).max(axis=(0, 2))
-    if not (share <= 1.0).all():
-        at = int(np.argmax(np.where(np.isfinite(share), share, np.inf)))
+    ratio = (np.abs(difference) / _ROUNDING_TOLERANCES[:, None, None]).max(axis=(0, 2))
+    if not (ratio <= 1.0).all():
+        at = int(np.argmax(np.where(np.isfinite(ratio), ratio, np.inf)))
         raise NotCertifiedError(
-            f"the vehicle's single precision is off by {share[at]:.3g} times what it may at {times[at]:.2f} s",
+            f"the vehicle's single precision is off by {ratio[at]:.3g} times what it may at {times[at]:.2f} s",
             where="the pieces", hint="use shorter pieces, or fly nearer to the origin",
         )  # fmt: skip

@@ -1,6 +1,7 @@
 """The pilot: its phases, preflight, the stream of setpoints, the abort ladder, and its process."""
 
 __all__ = [
+    "conducted",
     "deadlines",
     "health",
     "keys",

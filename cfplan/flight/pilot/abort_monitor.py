@@ -32,10 +32,10 @@ class Observation:
     pose: Pose | None = None  # the last good one
     pose_fault: str = ""  # why none has come since
     health: Health = field(default_factory=Health)
-    wanted: Triple | None = None
+    setpoint_at_pose: Triple | None = None
     """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
     estimate: Estimate | None = None  # None while its log is gone
-    asked: Triple | None = None
+    setpoint_at_estimate: Triple | None = None
     """m, where the vehicle should have been at the time of its estimate; None where no setpoint says so."""
     status: VehicleStatus | None = None  # None while its log is gone
     late: float = 0.0  # s, by which the last setpoint missed its deadline
@@ -114,8 +114,8 @@ class AbortMonitor:
         if observation.pose is not None:
             beyond = self._beyond_fence(observation.pose.position)
             yield _ladder_abort(limits.fence, 0.0 if inside(beyond) else beyond, AbortReason.BEYOND_FENCE)
-            if observation.wanted is not None:
-                deviation = math.dist(observation.pose.position, observation.wanted)
+            if observation.setpoint_at_pose is not None:
+                deviation = math.dist(observation.pose.position, observation.setpoint_at_pose)
                 yield _ladder_abort(limits.deviation, deviation, AbortReason.DEVIATION)
         estimate = observation.estimate
         if (
@@ -138,11 +138,11 @@ class AbortMonitor:
 
     def _fallen(self, observation: Observation) -> Iterator[Abort]:
         """Yield that a vehicle without poses lies on the floor: what it believes after that is worth nothing."""
-        estimate, asked = observation.estimate, observation.asked
-        if estimate is None or asked is None or observation.health.poses is FRESH:
+        estimate, setpoint = observation.estimate, observation.setpoint_at_estimate
+        if estimate is None or setpoint is None or observation.health.poses is FRESH:
             return
-        floor, below = self._limits.space.low[2], asked[2] - estimate.position[2]
-        if estimate.position[2] < floor < asked[2] and below > FALLEN:  # landings ask for places beneath the floor
+        floor, below = self._limits.space.low[2], setpoint[2] - estimate.position[2]
+        if estimate.position[2] < floor < setpoint[2] and below > FALLEN:  # landings ask for places beneath the floor
             yield AbortReason.FALLEN.abort(Rung.CUT, metres=below)
 
     def _beyond_fence(self, position: Triple) -> float:

@@ -35,6 +35,12 @@ class AbortReason(Enum):
         "restart the vehicle before the next flight",
         ExitCode.ENDED_BY_OPERATOR,
     )
+    FLEET_BRAKES = (
+        "the fleet brakes: {reason}",
+        "Vehicles of a fleet brake and land together: another one left its plan, does not answer or came too near, or "
+        "the process that conducts them is silent.",
+        "look at the vehicle that ended first",
+    )
     MAIN_PROCESS_GONE = (
         "the main process is gone",
         "The terminal was closed or the command was killed. The pilot is a separate process and landed the vehicle.",
@@ -93,7 +99,8 @@ class AbortReason(Enum):
     )
     BATTERY_LOW = (
         "the battery is down to {volts:.2f} V",
-        "The average under load is below `battery.under_load`. The vehicle lands.",
+        "The average under load is below `battery.under_load`, or the hover after take-off shows that it cannot give "
+        "the plan's largest motor thrust. The vehicle lands.",
         "charge the battery, or use a fresh one: old ones sag",
     )
     BEYOND_FENCE = (
@@ -128,6 +135,14 @@ class AbortReason(Enum):
         "the vehicle does not rise",
         "At the end of the take-off it is below half its height. It lands.",
         "charge the battery, check the propellers, and compare mass and thrust with the airframe",
+    )
+    OTHER_THRUST = (
+        "in hover the thrust scale is {scale:.2f}, and the plan was certified for {least:.2f} to {most:.2f}: set "
+        "`mass: {mass:.4f}` in the airframe file if it weighs that, else `thrust_scale: {scale:.2f}`",
+        "In the second after take-off the motors' commands and the battery's voltage show how much thrust carries the "
+        "weight. The vehicle is heavier or lighter, or its motors are weaker or stronger, than `mass`, `thrust_scale` "
+        "and `spread` of the airframe say. It lands before the way to the start.",
+        "weigh it with its battery, change that line of the airframe file, and plan again",
     )
     NOT_AT_START = (
         "still {metres:.2f} m from the start",

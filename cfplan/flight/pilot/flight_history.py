@@ -35,7 +35,7 @@ class FlightHistory:
         self.phases.append((phase, now))
         self.report(PhaseEntered(now, phase))
 
-    def say(self, level: Level, text: str) -> None:
+    def add_event(self, level: Level, text: str) -> None:
         """Report an event."""
         self.report(Event(self._now(), level, text))
 

@@ -21,6 +21,7 @@ from cfplan.flight.mocap.pose_tracker import PoseTracker
 from cfplan.flight.mocap.poses import Pose, PoseSource
 from cfplan.flight.pilot.abort_monitor import AbortMonitor, Observation, fault_abort, ordered
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.health import FRESH, GONE, UPLINK_GONE, Descent, Health, HealthMonitor
@@ -34,16 +35,16 @@ from cfplan.flight.setpoints.commitment import Commitment, splice
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import gains_under
-from cfplan.flight.telemetry import Estimate, Level, PlanCommitted, PoseReceived, Triple, VehicleStatus
+from cfplan.flight.telemetry import Estimate, Level, Phase, PlanCommitted, PoseReceived, Triple, VehicleStatus
 from cfplan.safety.space import Space
 from cfplan.vehicle.rotations import yaw_of
 
-TRIES = 3
+ATTEMPTS = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
 MOTOR_TEST_PERIOD = 0.1  # s between two questions whether a motor test is on
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
-_BRAKES_IN = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
-_STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
+_BRAKING_TIME = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
+_MAX_STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
 
 
 class OrderSource(Protocol):
@@ -80,8 +81,11 @@ class FlightLoop:
         history: FlightHistory,
         proposals: ProposalSource = NO_PROPOSALS,
         clock: Clock = REAL_CLOCK,
+        *,
+        conductor: ConductorSource = NO_CONDUCTOR,
     ):
         self.mission, self.limits, self.history, self.now = mission, mission.limits, history, clock.now
+        self._conductor = conductor
         self._source, self._orders, self._proposals, self._clock = source, orders, proposals, clock
         self._monitor, self.tracker = AbortMonitor(mission.limits), PoseTracker(mission.limits.pose)
         self._health_monitor, self.health = HealthMonitor(mission.limits.pose), Health()
@@ -95,23 +99,23 @@ class FlightLoop:
         self.commitment = Commitment(0, mission.payloads, mission.stops)
         self.plan = stream_of(self.commitment, mission.rate, on_board=mission.on_board is not None)
         self.stream: Stream | None = None  # what each tick sends
-        self._left_alone = False
+        self._unheard = False
         """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
         self._sent_at = math.inf  # s, when the last setpoint was sent
         self._faults = set[str]()  # steps of a tick that have failed
         self._just_sent = -1  # number of the last setpoint of the plan that was sent; -1 before the first
-        self._begun: deque[Stream] = deque(maxlen=_STREAMS)  # the last streams, each with its start
+        self._begun: deque[Stream] = deque(maxlen=_MAX_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why no good pose comes
         self._forwarded = math.inf  # s, the time of the last pose that was forwarded
         self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
-        self._asked_motor_test = math.inf  # s, when the vehicle was last asked whether a motor test is on
+        self._motor_test_polled = math.inf  # s, when the vehicle was last asked whether a motor test is on
         self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
 
     # Connecting, and what the loop serves.
 
     def connect(self, connect: Callable[[Callable[[], None]], Link]) -> None:
         """Connect to the vehicle; orders count meanwhile. Raises AbortRaised, and what `connect` raises."""
-        self._link = connect(self._obey_orders)
+        self._link = connect(self._check_orders)
 
     @property
     def connected(self) -> bool:
@@ -136,7 +140,7 @@ class FlightLoop:
 
     def watch_motor_test(self) -> None:
         """From now on a motor test that another client starts is ended, and ends the flight."""
-        self._asked_motor_test = -math.inf
+        self._motor_test_polled = -math.inf
 
     def lift_off(self) -> None:
         """From now on every trigger of the abort ladder counts, not only orders."""
@@ -210,19 +214,19 @@ class FlightLoop:
             self.commitment = answer
             self.plan = self.stream = self._begun[-1] = stream_of(answer, self.mission.rate, self.plan.start)
             if not proposal.goes_on:
-                self.history.say(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
+                self.history.add_event(Level.INFO, f"a new plan is flown from setpoint {answer.splices[-1]} on")
         else:
-            self.history.say(Level.WARNING, f"a new plan is refused: {answer}")
+            self.history.add_event(Level.WARNING, f"a new plan is refused: {answer}")
         self._proposals.answer(proposal, answer)
 
-    def wanted(self, time: float) -> Triple | None:
+    def setpoint_position(self, time: float) -> Triple | None:
         """Return where the vehicle was asked to be, m, at a time, s; None before the streams that are remembered."""
         moment = time - self.mission.lead
         if self.stream is None:
             return None
         return next((stream.position(moment) for stream in reversed(self._begun) if stream.start <= moment), None)
 
-    def asked(self) -> tuple[Triple, Triple, float]:
+    def setpoint_now(self) -> tuple[Triple, Triple, float]:
         """Return position, m, velocity, m/s, and yaw, rad, that the vehicle is asked for now, by its stream."""
         assert self.stream is not None
         position, velocity, _, quaternion, _ = self.stream.state(self.stream.index(self.now()))
@@ -233,7 +237,7 @@ class FlightLoop:
     @property
     def descent(self) -> Descent:
         """Return how the vehicle comes down now."""
-        return Descent.HELD if self._left_alone else self.health.reaction.descent
+        return Descent.HELD if self._unheard else self.health.reaction.descent
 
     def hold_where_it_is(self) -> None:
         """Send a hover near where the vehicle is; once the vehicle acknowledges, it is no longer left alone.
@@ -241,18 +245,18 @@ class FlightLoop:
         The place is that of the poses, without them that of the vehicle's estimate, or else where it was seen last.
         """
         estimate, space = self.link.estimate, self.limits.space
-        position, velocity, yaw = self.seen()
+        position, velocity, yaw = self.tracked_state()
         if self.health.poses is not FRESH:
             velocity = 0.0, 0.0, 0.0
             if estimate is not None and self.health.estimate is FRESH:
                 position, velocity, yaw = estimate.position, estimate.velocity, yaw_of(estimate.quaternion)
         (x, y, z), rate = position, self.mission.rate
-        place = _between_walls((x + _BRAKES_IN * velocity[0], y + _BRAKES_IN * velocity[1], z), space)
+        place = _between_walls((x + _BRAKING_TIME * velocity[0], y + _BRAKING_TIME * velocity[1], z), space)
         if space.obstacles and not space.holds(place):  # stay here rather than enter an obstacle ahead
             place = _between_walls((x, y, z), space)
         motion = hover_to_hover(place, yaw, place, yaw, 1.0 / rate, rate)
         self.begin(Stream(encode_motion(motion, motion.acceleration, gains_under(self.limits), space=space), rate))
-        self._left_alone = self.health.uplink is not FRESH
+        self._unheard = self.health.uplink is not FRESH
 
     # Ticks.
 
@@ -267,8 +271,8 @@ class FlightLoop:
         self._guard("motor test", lambda: self._end_motor_test(now))
         self._take_poses()
         self._guard("proposals", lambda: self._consider_due_proposal(now))
-        self._guard("logs", lambda: self._look(now))
-        self._obey_orders()
+        self._guard("logs", lambda: self._update_health(now))
+        self._check_orders()
         self._guard("abort monitor", lambda: self._monitor_flight(now, late))
         return now
 
@@ -291,7 +295,7 @@ class FlightLoop:
             return
         index = stream.index(now)
         if not stream.on_board:
-            self._left_alone |= self.airborne and now - self._sent_at > UPLINK_GONE
+            self._unheard |= self.airborne and now - self._sent_at > UPLINK_GONE
             self.link.send(stream.packet(index))
             self._sent_at = now
         if self.history.first_setpoint:
@@ -307,8 +311,8 @@ class FlightLoop:
 
     def _end_motor_test(self, now: float) -> None:
         """End a motor test that was started since preflight, and raise AbortRaised; at each tick until it has ended."""
-        if self.health.uplink is FRESH and now - self._asked_motor_test > MOTOR_TEST_PERIOD:
-            self._asked_motor_test = now
+        if self.health.uplink is FRESH and now - self._motor_test_polled > MOTOR_TEST_PERIOD:
+            self._motor_test_polled = now
             self.link.ask_motor_test()
         if self.link.motor_test:
             self.link.end_motor_test()
@@ -319,7 +323,7 @@ class FlightLoop:
             self._just_sent = self.plan.number(now)
             self._consider_proposal(now, self._just_sent)
 
-    def _look(self, now: float) -> None:
+    def _update_health(self, now: float) -> None:
         """Compute the health of this tick, and create anew the logs that the vehicle no longer sends."""
         link = self.link
         self.health = self._health_monitor.look(
@@ -330,11 +334,11 @@ class FlightLoop:
             status=link.status.time if link.status is not None else -math.inf,
         )
         streams = self.stream is not None and not self.stream.on_board
-        self._left_alone |= self.airborne and streams and self.health.uplink is GONE
+        self._unheard |= self.airborne and streams and self.health.uplink is GONE
         if self.health.uplink is FRESH and self._feeding:
             for log in ("estimate", "status"):
                 if getattr(self.health, log) is GONE:
-                    link.revive_log(log)
+                    link.recreate_log(log)
 
     def _take_poses(self) -> None:
         """Forward the poses that have come. After take-off, a fault here counts as no pose: the last one grows old."""
@@ -347,7 +351,7 @@ class FlightLoop:
                 raise
             if not self.pose_fault:
                 self.pose_fault = f"fault in the pilot: {error!r}"
-                self.history.say(Level.ERROR, f"pose: {self.pose_fault}")
+                self.history.add_event(Level.ERROR, f"pose: {self.pose_fault}")
 
     def _forward_poses(self) -> None:
         tracker, link, step = self.tracker, self.link, self.tracker.step
@@ -359,18 +363,18 @@ class FlightLoop:
             if tracker.last is pose:
                 self._note_deviation(pose)
         if tracker.step and not step:
-            self.history.say(Level.WARNING, f"pose: a step of {tracker.step:.2f} m reaches the vehicle slowly")
+            self.history.add_event(Level.WARNING, f"pose: a step of {tracker.step:.2f} m reaches the vehicle slowly")
         now = self.now()
         sent = tracker.to_send(now)
         if sent is not None and tracker.last is not None:
             link.send_pose(*sent)
             self._forwarded = tracker.last.time
-        slow = self._tolerated is Rung.NONE and not (self.history.first_setpoint or self._left_alone)
+        slow = self._tolerated is Rung.NONE and not (self.history.first_setpoint or self._unheard)
         tracker.compare_motion(now, self.limits.flight.patience, slow=slow)
         why = tracker.distrusted or self._source.fault or tracker.fault
         if why != self.pose_fault:
             self.pose_fault = why
-            self.history.say(Level.WARNING, f"pose: {why or 'good again'}")
+            self.history.add_event(Level.WARNING, f"pose: {why or 'good again'}")
 
     def _note_deviation(self, pose: Pose) -> None:
         moment = pose.time - self.mission.lead
@@ -402,9 +406,9 @@ class FlightLoop:
             pose=pose,
             pose_fault=self.pose_fault,
             health=self.health,
-            wanted=self.wanted(pose.time) if pose is not None else None,
+            setpoint_at_pose=self.setpoint_position(pose.time) if pose is not None else None,
             estimate=estimate,
-            asked=self.wanted(estimate.time) if estimate is not None else None,
+            setpoint_at_estimate=self.setpoint_position(estimate.time) if estimate is not None else None,
             status=self.status,
             late=late if self.stream is not None and not self.stream.on_board else 0.0,
         )
@@ -422,9 +426,14 @@ class FlightLoop:
         status = self.link.status
         return status is not None and status.time > self._stop_expected and not any(status.motor)
 
-    def _obey_orders(self) -> None:
-        """Raise AbortRaised for an operator command or the loss of the main process; also without a link."""
+    def _check_orders(self) -> None:
+        """Raise AbortRaised for an operator command, the fleet's braking, or the loss of the main process.
+
+        Also without a link.
+        """
         abort = ordered(self._orders.worst, main_gone=self._orders.gone)
+        if abort is None and (reason := self._conductor.brakes(self.now())):
+            abort = AbortReason.FLEET_BRAKES.abort(Rung.BRAKE, reason=reason)
         if abort is not None:
             self._leave_for(abort)
 
@@ -452,6 +461,13 @@ class FlightLoop:
                 return True
         return done()
 
+    def await_clearance(self, phase: Phase) -> None:
+        """Tick until the fleet's conductor lets a phase begin; return at once where there is none."""
+        conductor = self._conductor
+        conductor.ask(phase)
+        if conductor.clearance(phase) > self.now():
+            self.until(lambda: conductor.clearance(phase) <= self.now(), math.inf)
+
     def pause(self, duration: float) -> None:
         """Tick for `duration`, s."""
         self.until(lambda: False, duration)
@@ -464,7 +480,7 @@ class FlightLoop:
         assert pose is not None
         return pose
 
-    def seen(self) -> tuple[Triple, Triple, float]:
+    def tracked_state(self) -> tuple[Triple, Triple, float]:
         """Return position, m, velocity, m/s, and yaw, rad, now, by the last good poses."""
         return self.tracker.position(self.now()), self.tracker.velocity, yaw_of(self.pose().quaternion)
 
@@ -473,7 +489,7 @@ class FlightLoop:
         return self.tracker.heights(self.now() - duration)
 
     @property
-    def blind_for(self) -> float:
+    def time_without_poses(self) -> float:
         """Return how long, s, the vehicle has been without a pose: late ones are not forwarded."""
         return self.now() - self._forwarded
 

@@ -24,8 +24,8 @@ _KEY = re.compile(  # an arrow or function key as terminals send it, else a sing
     rb"\x1b(?:(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\[\[[A-E]|\[[0-?]*[!-/]*[@-Z\\-~]|O[0-9;]*[A-Za-z])|(?P<byte>.)",
     re.DOTALL,
 )
-_BEGUN = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # an incomplete arrow or function key
-_MOST_TYPED = 1000  # keys that are kept until somebody asks for them
+_PARTIAL_KEY = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # an incomplete arrow or function key
+_MAX_TYPED = 1000  # keys that are kept until somebody asks for them
 
 
 class Order(IntEnum):
@@ -88,7 +88,7 @@ class Keyboard:
         """Take `keys` too, or leave what is typed to another reader; signals count either way."""
         self._keys = keys
         self._orders: deque[Order] = deque()
-        self._typed: deque[str] = deque(maxlen=_MOST_TYPED)
+        self._typed: deque[str] = deque(maxlen=_MAX_TYPED)
         self._opened: int | None = None  # the program's own terminal, where standard input is another
         self._interrupts = 0
         self._terminal: tuple[int, list[Any]] | None = None
@@ -172,7 +172,7 @@ def _burst(terminal: int) -> bytes:
             keys += more
             if more:
                 continue
-            begun = _BEGUN.search(keys)
+            begun = _PARTIAL_KEY.search(keys)
             if begun is None or Order.CUT in orders_of(keys[: begun.start()]):
                 break
             left = until.setdefault(begun.start(), REAL_CLOCK.now() + _ESCAPE_WAIT) - REAL_CLOCK.now()

@@ -15,7 +15,7 @@ from collections.abc import Callable
 
 from cfplan.flight.pilot.abort_monitor import FALLEN
 from cfplan.flight.pilot.abort_reasons import AbortReason
-from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
+from cfplan.flight.pilot.flight_loop import ATTEMPTS, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import FRESH, Descent
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
@@ -23,21 +23,24 @@ from cfplan.flight.radio.supervisor_bits import FLYING
 from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, off_walls, sinking
 from cfplan.flight.telemetry import Level, Phase, Triple
 
-_BENEATH_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
+_DEPTH_BELOW_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
 _NEAR_FLOOR = 0.15  # m above where it took off
-_NOT_FOLLOWING = 0.05  # m that a standing vehicle is above its setpoint, near the floor
-_NOT_HELD = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
-_LIES_FOR, _LIES_WITHIN = 0.08, 0.02  # s and m: poses so near to where it took off from show that it is on the floor
+_STANDING_GAP = 0.05  # m that a standing vehicle is above its setpoint, near the floor
+_NO_THRUST_GAP = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
+_AT_REST_FOR, _AT_REST_WITHIN = (
+    0.08,
+    0.02,
+)  # s and m: poses so near to where it took off from show that it is on the floor
 _STANDS_FOR = 0.3  # s
 _STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
-_SETTLE = 0.3  # s at the end of a descent before the motors stop
-_BLIND_BENEATH = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
+_SETTLE_TIME = 0.3  # s at the end of a descent before the motors stop
+_BLIND_DEPTH_BELOW_FLOOR = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
 MAX_BLIND_LANDING = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
-_CLEAR = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
+_MIN_SINKING_HEIGHT = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
 POSES_TRUSTED_AFTER = 0.2  # s of fresh poses, so several of them, after which they are trusted again
-MOTORS_STOP_WITHIN = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
-_LOOK_AGAIN = 0.05  # s
-_BENEATH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
+MOTORS_STOP_TIMEOUT = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
+_RETRY_PERIOD = 0.05  # s
+_ESTIMATE_DEPTH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
 _IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
 
 
@@ -63,7 +66,7 @@ class Landing:
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            sinks = sinking(left, self._floor + _CLEAR, QUICK.speed, stream.rate, loop.limits.space)
+            sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, loop.limits.space)
             loop.begin(Stream(sinks, stream.rate))
 
     def land(self) -> None:
@@ -73,7 +76,7 @@ class Landing:
         while not self._stands:
             if self._loop.descent is Descent.HELD:
                 self._loop.hold_where_it_is()
-                self._loop.pause(_LOOK_AGAIN)
+                self._loop.pause(_RETRY_PERIOD)
             elif self._blind_on_floor():
                 self._conclude(True)
             elif self._loop.descent is Descent.BLIND:
@@ -87,39 +90,39 @@ class Landing:
     def _descend(self) -> None:
         """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
         loop = self._loop
-        lowest = min(self._floor, loop.limits.space.low[2]) - _BENEATH_FLOOR
+        lowest = min(self._floor, loop.limits.space.low[2]) - _DEPTH_BELOW_FLOOR
         pace = gentle(loop.limits.ground.land_speed)
-        self._sink(loop.seen() if self._was_blind else loop.asked(), pace, lowest)
+        self._sink(loop.tracked_state() if self._was_blind else loop.setpoint_now(), pace, lowest)
         self._was_blind = False
 
         def interrupted() -> bool:
             return self._blind_on_floor() or loop.descent is not Descent.BY_POSES
 
         def stands() -> bool:
-            return stands_by_poses(loop, self._floor, _NOT_HELD) or self._lies()
+            return stands_by_poses(loop, self._floor, _NO_THRUST_GAP) or self._at_take_off_place()
 
-        loop.until(lambda: stands() or self._sunk() or interrupted(), math.inf)
+        loop.until(lambda: stands() or self._setpoint_at_end() or interrupted(), math.inf)
         if not interrupted():
             self._conclude(stands())
 
     def _descend_blindly(self) -> None:
         """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
         loop = self._loop
-        begin = loop.asked()
-        self._sink(begin, QUICK, self._floor - _BLIND_BENEATH, off_walls(begin[0], loop.limits.space))
+        begin = loop.setpoint_now()
+        self._sink(begin, QUICK, self._floor - _BLIND_DEPTH_BELOW_FLOOR, off_walls(begin[0], loop.limits.space))
         self._was_blind = True
-        seen_since = math.inf
+        fresh_since = math.inf
 
-        def seen() -> bool:
-            nonlocal seen_since
-            seen_since = min(seen_since, loop.now()) if loop.health.poses is FRESH else math.inf
-            return loop.now() - seen_since > POSES_TRUSTED_AFTER
+        def poses_back() -> bool:
+            nonlocal fresh_since
+            fresh_since = min(fresh_since, loop.now()) if loop.health.poses is FRESH else math.inf
+            return loop.now() - fresh_since > POSES_TRUSTED_AFTER
 
         def over() -> bool:
-            return self._sunk() or loop.blind_for > MAX_BLIND_LANDING or self._beneath_by_estimate()
+            return self._setpoint_at_end() or loop.time_without_poses > MAX_BLIND_LANDING or self._beneath_by_estimate()
 
         def interrupted() -> bool:
-            return seen() or loop.descent is Descent.HELD
+            return poses_back() or loop.descent is Descent.HELD
 
         loop.until(lambda: self._stands_by_estimate() or over() or interrupted(), math.inf)
         if not interrupted():
@@ -140,30 +143,30 @@ class Landing:
         )
         loop.begin(Stream(sinks, rate))
 
-    def _lies(self) -> bool:
+    def _at_take_off_place(self) -> bool:
         """Return whether poses show the vehicle on the floor, far below its setpoint: it fell there.
 
         It believes a motion that the floor has ended, and would fly off by that as its setpoint lifts it again.
         """
-        heights = self._loop.heights(_LIES_FOR)
-        on_floor = bool(heights) and max(heights) - self._floor < _LIES_WITHIN
-        return on_floor and self._loop.asked()[0][2] - self._floor > FALLEN
+        heights = self._loop.heights(_AT_REST_FOR)
+        on_floor = bool(heights) and max(heights) - self._floor < _AT_REST_WITHIN
+        return on_floor and self._loop.setpoint_now()[0][2] - self._floor > FALLEN
 
-    def _sunk(self) -> bool:
+    def _setpoint_at_end(self) -> bool:
         stream = self._loop.stream
-        return stream is None or self._loop.now() > stream.end + _SETTLE
+        return stream is None or self._loop.now() > stream.end + _SETTLE_TIME
 
     def _blind_on_floor(self) -> bool:
         """Return whether no good poses come of a vehicle whose setpoint, led by those before, is on the floor."""
         loop = self._loop
         if loop.stream is None or self._was_blind or loop.descent is Descent.HELD:
             return False
-        return loop.health.poses is not FRESH and loop.asked()[0][2] < self._floor
+        return loop.health.poses is not FRESH and loop.setpoint_now()[0][2] < self._floor
 
     def _conclude(self, shown: bool) -> None:
         self._stands = True
         if not shown:
-            self._loop.history.say(Level.WARNING, "nothing shows that the vehicle stands; its motors are stopped")
+            self._loop.history.add_event(Level.WARNING, "touchdown is not confirmed; the motors are stopped")
 
     def _beneath_by_estimate(self) -> bool:
         """Return whether the vehicle believes itself far beneath the floor, and would climb from there.
@@ -171,7 +174,7 @@ class Landing:
         It stands then, after a fall that its sensors did not follow, or is as low as its estimate was wrong.
         """
         estimate = self._loop.estimate
-        return estimate is not None and estimate.position[2] < self._floor - _BENEATH
+        return estimate is not None and estimate.position[2] < self._floor - _ESTIMATE_DEPTH
 
     def _stands_by_estimate(self) -> bool:
         """Return whether the estimate is so far above its setpoint, or the motors are off for so long, that it stands.
@@ -185,8 +188,8 @@ class Landing:
                 return True
         if estimate is None or loop.health.estimate is not FRESH:
             return False
-        wanted = loop.wanted(estimate.time)
-        return wanted is not None and estimate.position[2] - wanted[2] > _NOT_HELD
+        setpoint_position = loop.setpoint_position(estimate.time)
+        return setpoint_position is not None and estimate.position[2] - setpoint_position[2] > _NO_THRUST_GAP
 
 
 def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) -> bool:
@@ -195,12 +198,12 @@ def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) 
     Near the `floor`, m, a little above its setpoint is enough; elsewhere it is to be `not_held`, m, above it.
     """
     pose = loop.pose()
-    wanted, heights = loop.wanted(pose.time), loop.heights(_STANDS_FOR)
-    if wanted is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
+    setpoint_position, heights = loop.setpoint_position(pose.time), loop.heights(_STANDS_FOR)
+    if setpoint_position is None or not heights or max(heights) - min(heights) > _STANDS_WITHIN:
         return False
     height = pose.position[2]
     near = height - floor < _NEAR_FLOOR
-    return height - wanted[2] > (_NOT_FOLLOWING if near else not_held)
+    return height - setpoint_position[2] > (_STANDING_GAP if near else not_held)
 
 
 def stop_motors(loop: FlightLoop) -> bool:
@@ -210,21 +213,21 @@ def stop_motors(loop: FlightLoop) -> bool:
     """
 
     def send() -> None:
-        for _ in range(TRIES):
+        for _ in range(ATTEMPTS):
             loop.link.stop_setpoint()
             loop.pause(0.02)
-        for _ in range(TRIES):
+        for _ in range(ATTEMPTS):
             loop.link.release_priority()
             loop.pause(0.02)
 
-    return stop_until_seen(loop, send)
+    return stop_until_confirmed(loop, send)
 
 
-def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
+def stop_until_confirmed(loop: FlightLoop, send: Callable[[], object]) -> bool:
     """Call `send`, which stops the motors, until the vehicle reports that it no longer flies; return whether they stop.
 
-    There are TRIES calls at most. If the vehicle then acknowledges but does not report its status, the motors count as
-    stopped.
+    There are at most ATTEMPTS calls. If the vehicle then acknowledges but does not report its status, its motors count
+    as stopped.
     """
 
     def stopped() -> bool:
@@ -232,9 +235,9 @@ def stop_until_seen(loop: FlightLoop, send: Callable[[], object]) -> bool:
 
     loop.end_stream()
     loop.expect_stop()
-    for _ in range(TRIES):
+    for _ in range(ATTEMPTS):
         send()
-        loop.until(lambda: stopped() or loop.health.status_unknown, MOTORS_STOP_WITHIN)
+        loop.until(lambda: stopped() or loop.health.status_unknown, MOTORS_STOP_TIMEOUT)
         if stopped():
             return True
     return loop.health.status_unknown

@@ -7,6 +7,7 @@ from typing import Protocol
 from cfplan.errors import PreflightError
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
+from cfplan.flight.pilot.hover_check import check_hover
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
@@ -19,7 +20,7 @@ _AT_PLACE_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 READY_TIMEOUT = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
 # m above the floor: when the setpoint has reached the first, the pose must have reached the second
-_ASKED_TO_RISE, _RISEN = 0.12, 0.015
+_SETPOINT_RISE, _POSE_RISE = 0.12, 0.015
 
 
 class Manoeuvres(Protocol):
@@ -52,7 +53,7 @@ def _require_ready(loop: FlightLoop) -> None:
     if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, READY_TIMEOUT):
         return
     if loop.status is None:
-        raise PreflightError("the vehicle does not tell its status", where="vehicle", hint="restart it and try again")
+        raise PreflightError("the vehicle does not report its status", where="vehicle", hint="restart it and try again")
     faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))
     armed = "is armed and not ready to fly" if loop.bits(ARMED) else "is no longer armed"
     raise PreflightError(
@@ -69,6 +70,7 @@ def begin_take_off(
 
     `way_between` two places makes setpoints. Raises PreflightError where the vehicle may not fly.
     """
+    loop.await_clearance(Phase.TAKE_OFF)
     loop.history.enter(Phase.TAKE_OFF)
     height, (x, y, _) = loop.mission.take_off_height, loop.pose().position
     yaw = yaw_of(loop.pose().quaternion)
@@ -84,7 +86,8 @@ def begin_take_off(
 def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Callable[[], object]) -> None:
     """Wait until the vehicle has climbed along `way` from the `floor` to a `height`, m; `stop` stops its motors.
 
-    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises.
+    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises or where its hover shows
+    another thrust than was certified.
     """
 
     def stays() -> bool:
@@ -95,6 +98,7 @@ def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Call
     loop.until(lambda: abs(loop.pose().position[2] - height) < _AT_PLACE_WITHIN, 2.0)
     if loop.pose().position[2] - floor < (height - floor) / 2:
         raise AbortRaised(AbortReason.DOES_NOT_RISE.abort(Rung.LAND))
+    check_hover(loop)
 
 
 def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
@@ -105,7 +109,7 @@ def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
     """
     pose = loop.pose()
     asked = way.position(pose.time - loop.mission.lead)[2]
-    return asked - floor > _ASKED_TO_RISE and pose.position[2] - floor < _RISEN
+    return asked - floor > _SETPOINT_RISE and pose.position[2] - floor < _POSE_RISE
 
 
 def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
@@ -122,7 +126,7 @@ def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
     raise PreflightError(
         "the tracked body stays on the floor while the vehicle takes off",
         where="motion capture",
-        hint="is it another body than the vehicle, are two of them swapped? Else look at battery and propellers",
+        hint="is it a different body, or are two bodies swapped? Otherwise check battery and propellers",
     )
 
 

@@ -16,9 +16,9 @@ from cfplan.flight.on_board import commands
 from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of, stop_targets
 from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.pilot.abort_reasons import AbortReason
-from cfplan.flight.pilot.flight_loop import TRIES, AbortRaised, FlightLoop
+from cfplan.flight.pilot.flight_loop import ATTEMPTS, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import GONE
-from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_seen
+from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_confirmed
 from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
@@ -32,11 +32,14 @@ from cfplan.flight.telemetry import Level, Phase
 from cfplan.vehicle.rotations import yaw_of
 
 ANSWER_TIMEOUT = 0.3  # s
-_KEPT_ALIVE_FOR = 0.4  # s before the motors turn: some packets, one of which starts the watchdog
+_KEEP_ALIVE_TIME = 0.4  # s before the motors turn: some packets, one of which starts the watchdog
 _QUICK_DESCENT = 1.5  # m/s², at most about, of a landing without poses, where the estimate goes wrong with time
 _SHORTEST_LANDING = 1.2  # s
-_TOUCH, _TOUCH_BLINDLY = 0.05, 0.5  # m beneath the floor that landings aim at; without poses the height is unsure
-_SETTLE = 0.5  # s at the end of a descent
+_LANDING_DEPTH, _BLIND_LANDING_DEPTH = (
+    0.05,
+    0.5,
+)  # m beneath the floor that landings aim at; without poses the height is unsure
+_SETTLE_TIME = 0.5  # s at the end of a descent
 
 
 def upload_program(loop: FlightLoop, program: OnBoardProgram) -> None:
@@ -53,10 +56,10 @@ def upload_program(loop: FlightLoop, program: OnBoardProgram) -> None:
     answer = _ask(loop, commands.define(program.pieces, compressed=program.compressed))
     if answer != commands.DONE:
         raise PreflightError(
-            f"the vehicle does not define the trajectory: {_what(answer)}", where="vehicle",
+            f"the vehicle does not define the trajectory: {_answer_text(answer)}", where="vehicle",
             hint="update its firmware, and restart it",
         )  # fmt: skip
-    loop.history.say(Level.INFO, f"{program.pieces} pieces in {len(program.memory)} bytes uploaded and read back")
+    loop.history.add_event(Level.INFO, f"{program.pieces} pieces in {len(program.memory)} bytes uploaded and read back")
 
 
 def _ask(
@@ -70,7 +73,7 @@ def _ask(
     `sent` is called at each sending. A command that was `taken`, as the vehicle's log shows, is not sent again.
     """
     number = command[0]
-    for attempt in range(TRIES):
+    for attempt in range(ATTEMPTS):
         loop.link.replies.pop(number, None)
         loop.link.command(command)
         sent()
@@ -83,7 +86,7 @@ def _ask(
     return None
 
 
-def _what(answer: int | None) -> str:
+def _answer_text(answer: int | None) -> str:
     """Return an answer in words."""
     return "it does not answer" if answer is None else commands.ANSWERS.get(answer, f"it answers {answer}")
 
@@ -101,13 +104,13 @@ class OnBoardManoeuvres:
         """Climb to a hover, once the watchdog runs. Raises PreflightError where the vehicle stays on the floor."""
         loop, height = self._loop, self._mission.take_off_height
         way, duration = begin_take_off(loop, self._floor, self._way)
-        loop.pause(_KEPT_ALIVE_FOR)
+        loop.pause(_KEEP_ALIVE_TIME)
         answer = _ask(loop, commands.take_off(height, duration), lambda: loop.begin(way))
         if answer != commands.DONE:
             self._stop_motors()
             loop.touch_down()
             raise PreflightError(
-                f"the vehicle does not take off: {_what(answer)}", where="vehicle",
+                f"the vehicle does not take off: {_answer_text(answer)}", where="vehicle",
                 hint="restart it on a level floor; its console says more",
             )  # fmt: skip
         assert loop.stream is not None
@@ -117,7 +120,7 @@ class OnBoardManoeuvres:
         """Fly to where the trajectory begins and wait until the vehicle is there."""
         loop = self._loop
         self._history.enter(Phase.GO_TO_START)
-        (x, y, z), _, yaw = loop.asked()
+        (x, y, z), _, yaw = loop.setpoint_now()
         start = self._program.begin
         duration = manoeuvre_time(math.dist(loop.pose().position, start[:3]), self._limits.ground.go_to_speed)
         way = self._way((x, y, z, yaw), start, duration)
@@ -138,7 +141,7 @@ class OnBoardManoeuvres:
             return status is not None and status.time > begun and not loop.bits(TRAJECTORY_FINISHED)
 
         self._require(_ask(loop, commands.start(), loop.begin_plan, flies), "start the trajectory")
-        self._history.say(Level.INFO, "the vehicle flies the trajectory on board")
+        self._history.add_event(Level.INFO, "the vehicle flies the trajectory on board")
         loop.until(lambda: loop.now() > loop.plan.start + loop.motion_ends, math.inf)
         self._history.enter(Phase.HOLD)
         loop.until(lambda: loop.now() > loop.plan.end, math.inf)
@@ -148,7 +151,7 @@ class OnBoardManoeuvres:
         loop = self._loop
         self._begin_landing()
         down = loop.begin(Stream(self._program.descent, self._mission.rate, on_board=True))
-        loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > down.end + _SETTLE, math.inf)
+        loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > down.end + _SETTLE_TIME, math.inf)
         self._end_landing()
 
     def brake(self) -> None:
@@ -167,7 +170,7 @@ class OnBoardManoeuvres:
     def _require(self, answer: int | None, what: str) -> None:
         """Raise AbortRaised unless the vehicle does as it is asked."""
         if answer != commands.DONE:
-            raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.LAND, command=what, answer=_what(answer)))
+            raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.LAND, command=what, answer=_answer_text(answer)))
 
     def _way(self, begin: tuple[float, ...], end: tuple[float, ...], duration: float) -> Stream:
         """Return what the commander flies from hover to hover, m and rad, as setpoints, with a stop from each."""
@@ -206,7 +209,7 @@ class OnBoardManoeuvres:
                 self._history.stopped_at = loop.now()
             answer = _ask(loop, commands.go_to(x, y, z, yaw, STOP_DURATION), lambda: loop.begin(stop))
             if answer != commands.DONE:
-                self._history.say(Level.WARNING, f"the vehicle does not stop: {_what(answer)}")
+                self._history.add_event(Level.WARNING, f"the vehicle does not stop: {_answer_text(answer)}")
         end = loop.stream.end if loop.stream is not None else 0.0
         loop.until(lambda: loop.now() > end, math.inf)
 
@@ -221,9 +224,9 @@ class OnBoardManoeuvres:
         if loop.stream is None:  # it was not asked to take off yet
             self._end_landing()
             return
-        (x, y, z), _, yaw = loop.asked()
+        (x, y, z), _, yaw = loop.setpoint_now()
         self._begin_landing()
-        lowest = self._floor - (_TOUCH_BLINDLY if loop.health.poses is GONE else _TOUCH)
+        lowest = self._floor - (_BLIND_LANDING_DEPTH if loop.health.poses is GONE else _LANDING_DEPTH)
         way = max(z - lowest, 0.0)
         quick = math.sqrt(7.513 * way / _QUICK_DESCENT)  # the peak of a septic's acceleration is 7.513 way / duration²
         duration = max(quick if loop.health.poses is GONE else way / self._limits.ground.land_speed, _SHORTEST_LANDING)
@@ -231,12 +234,14 @@ class OnBoardManoeuvres:
         down.stop_from = None
         answer = _ask(loop, commands.land(lowest, duration), lambda: loop.begin(down))
         if answer not in (commands.DONE, commands.BUSY):  # busy: it lands already
-            self._history.say(Level.WARNING, f"the vehicle does not land: {_what(answer)}; setpoints land it")
+            self._history.add_event(
+                Level.WARNING, f"the vehicle does not land: {_answer_text(answer)}; setpoints land it"
+            )
             landing = Landing(loop, self._floor)
             landing.begun = True
             landing.land()
             return
-        end = loop.stream.end + _SETTLE
+        end = loop.stream.end + _SETTLE_TIME
         loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > end, math.inf)
         self._end_landing()
 
@@ -248,4 +253,4 @@ class OnBoardManoeuvres:
 
     def _stop_motors(self) -> bool:
         """Stop the motors, and return whether the vehicle says so; its null setpoints count from then on."""
-        return stop_until_seen(self._loop, lambda: _ask(self._loop, commands.stop()))
+        return stop_until_confirmed(self._loop, lambda: _ask(self._loop, commands.stop()))

@@ -11,8 +11,9 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.pilot.abort_monitor import fault_abort
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.flight_history import FlightHistory
-from cfplan.flight.pilot.flight_loop import LINK_LOST_AFTER, TRIES, AbortRaised, FlightLoop, LinkLost, OrderSource
+from cfplan.flight.pilot.flight_loop import ATTEMPTS, LINK_LOST_AFTER, AbortRaised, FlightLoop, LinkLost, OrderSource
 from cfplan.flight.pilot.health import FRESH
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
@@ -41,12 +42,13 @@ class Pilot:
         orders: OrderSource,
         enter_real_time: Callable[[], None] = lambda: None,
         proposals: ProposalSource = NO_PROPOSALS,
+        conductor: ConductorSource = NO_CONDUCTOR,
         clock: Clock = REAL_CLOCK,
     ):
-        self._mission = mission
+        self._mission, self._conductor = mission, conductor
         self._connect, self._enter_real_time = connect, enter_real_time
         self._history = FlightHistory(report, clock)
-        self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock)
+        self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock, conductor=conductor)
         self._manoeuvres: Manoeuvres = StreamedManoeuvres(self._loop, floor=0.0)  # until that is known
 
     def fly(self) -> FlightOutcome:
@@ -58,7 +60,7 @@ class Pilot:
             why = loop.link.lost or f"nothing was acknowledged for {LINK_LOST_AFTER:g} s"
             lost = AbortReason.LINK_LOST.abort(self._history.rung, reason=why)
             exit_code, reason, self._history.hint = lost.exit_code, lost.text, lost.cure
-            self._history.say(Level.ERROR, reason)
+            self._history.add_event(Level.ERROR, reason)
         finally:
             self._finish()
         last_pose = loop.tracker.recent[-1] if loop.tracker.recent else None
@@ -95,9 +97,10 @@ class Pilot:
         exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
+            self._conductor.leave(abort)
             loop.tolerate(self._history.rung)
             level = Level.ERROR if abort.rung is Rung.CUT else Level.WARNING
-            self._history.say(level, f"{abort.rung.name.lower()}: {abort.text}")
+            self._history.add_event(level, f"{abort.rung.name.lower()}: {abort.text}")
             try:
                 if loop.airborne:
                     match abort.rung:
@@ -135,7 +138,7 @@ class Pilot:
             return status is not None and bool(status.supervisor & LOCKED) and not any(status.motor)
 
         if not locked() and not loop.until(locked, CUT_TIMEOUT):
-            self._history.say(Level.ERROR, "the vehicle does not say that its motors were cut")
+            self._history.add_event(Level.ERROR, "the vehicle does not confirm that its motors were cut")
         loop.touch_down()
 
     # The end.
@@ -149,9 +152,9 @@ class Pilot:
             loop.end_stream()
             try:
                 if not self._disarm():
-                    self._history.say(Level.WARNING, "the vehicle does not say that it is disarmed")
+                    self._history.add_event(Level.WARNING, "the vehicle does not confirm that it is disarmed")
             except (LinkLost, AbortRaised):
-                self._history.say(Level.WARNING, "the link went before the vehicle was disarmed")
+                self._history.add_event(Level.WARNING, "the link was lost before the vehicle was disarmed")
             locked = loop.bits(LOCKED)
             loop.link.close()
             if loop.watched and not locked:
@@ -163,7 +166,7 @@ class Pilot:
         """Disarm the vehicle; return whether it says so. Where the radio is dead, wait for it: it may come back."""
         loop, heard = self._loop, 0
         give_up = loop.now() + LINK_LOST_AFTER
-        while heard < TRIES and loop.now() < give_up:
+        while heard < ATTEMPTS and loop.now() < give_up:
             loop.link.arm(False)
             if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
                 return True
@@ -172,11 +175,11 @@ class Pilot:
 
     def _restart(self) -> None:
         """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""
-        self._history.say(Level.INFO, "the vehicle restarts for the next flight")
+        self._history.add_event(Level.INFO, "the vehicle restarts for the next flight")
         try:
             self._loop.link.restart()
         except LinkError as error:
-            self._history.say(Level.WARNING, str(error))
+            self._history.add_event(Level.WARNING, str(error))
 
 
 def _manoeuvres(loop: FlightLoop, floor: float) -> Manoeuvres:

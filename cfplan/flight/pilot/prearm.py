@@ -5,7 +5,7 @@ from collections.abc import Callable
 
 from cfplan.errors import InputError, PreflightError
 from cfplan.flight.pilot.deadlines import Lateness
-from cfplan.flight.pilot.flight_loop import TRIES, FlightLoop
+from cfplan.flight.pilot.flight_loop import ATTEMPTS, FlightLoop
 from cfplan.flight.pilot.on_board_manoeuvres import upload_program
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.preflight import PreflightSnapshot, check_traffic, run_checks, standing_check
@@ -19,7 +19,7 @@ from cfplan.vehicle.rotations import yaw_of
 
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
 CONVERGED_FOR = 1.0  # s
-_OBSERVED_FOR = 1.0  # s
+_OBSERVATION_TIME = 1.0  # s
 LISTEN_WHILE_ARMED = 0.2  # s, some messages of each log
 _ALL = 0xFFFF  # bits of supervisor.info
 
@@ -52,10 +52,11 @@ def prepare(
     stood = _converge(loop)
     _preflight(loop, read, stood)
     loop.watch_motor_test()
+    loop.await_clearance(Phase.ARM)
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
-    for _ in range(TRIES):  # a busy radio may give one up
+    for _ in range(ATTEMPTS):  # a busy radio may give one up
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
             _listen_while_armed(loop)
@@ -72,7 +73,7 @@ def _configure(loop: FlightLoop) -> dict[str, float]:
             if rule.action is Action.SET:
                 link.set_parameter(rule.name, rule.value(limits))
         elif rule.missing:
-            loop.history.say(Level.WARNING, f"the vehicle has no {rule.name}: {rule.missing}")
+            loop.history.add_event(Level.WARNING, f"the vehicle has no {rule.name}: {rule.missing}")
     return link.read_parameters([rule.name for rule in PARAMETER_RULES])
 
 
@@ -114,20 +115,20 @@ def _converge(loop: FlightLoop) -> Triple:
         return now - agreed_since >= CONVERGED_FOR
 
     if not loop.until(agreed, 10.0):
-        loop.history.say(Level.WARNING, "the vehicle's estimate does not settle")
+        loop.history.add_event(Level.WARNING, "the vehicle's estimate does not settle")
     return pose.position
 
 
 def _preflight(loop: FlightLoop, read: dict[str, float], stood: Triple) -> None:
     """Run the preflight checks, up to three times: an auto-arming vehicle is briefly not ready."""
     loop.history.enter(Phase.PREFLIGHT)
-    for _ in range(TRIES):
+    for _ in range(ATTEMPTS):
         loop.history.checks = run_checks(_observe(loop, read, stood))
         if all(check.passed for check in loop.history.checks):
             break
     for check in loop.history.checks:
         text = f"{check.name}: {check.value} ({check.threshold})"
-        loop.history.say(Level.INFO if check.passed else Level.ERROR, text)
+        loop.history.add_event(Level.INFO if check.passed else Level.ERROR, text)
     failed = [check for check in loop.history.checks if not check.passed]
     if failed:
         raise PreflightError(
@@ -139,7 +140,7 @@ def _preflight(loop: FlightLoop, read: dict[str, float], stood: Triple) -> None:
 
 def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> PreflightSnapshot:
     """Observe for a second and return what is known of the vehicle."""
-    traffic = _listen(loop, _OBSERVED_FOR)
+    traffic = _listen(loop, _OBSERVATION_TIME)
     link = loop.link
     assert link.estimate is not None  # the log has come since configuring
     assert link.status is not None

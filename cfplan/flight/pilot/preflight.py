@@ -222,9 +222,9 @@ def standing_check(stood: Triple, seen: Triple, limits: Limits) -> Check:
     """
     most, moved = limits.pose.agreement, math.dist(stood, seen)
     return Check(
-        "way that the standing body went", f"{moved * 1e3:.0f} mm", f"≤ {most * 1e3:.0f} mm", moved <= most,
-        "if nobody moved the vehicle, motion capture has taken another body for it or shifted its frame: check both, "
-        "then start again",
+        "drift of the standing body", f"{moved * 1e3:.0f} mm", f"≤ {most * 1e3:.0f} mm", moved <= most,
+        "if nobody moved the vehicle, motion capture has confused it with another body or shifted its frame: check "
+        "both, then start again",
     )  # fmt: skip
 
 
@@ -273,7 +273,7 @@ def check_start_place(snapshot: PreflightSnapshot) -> Check:
     worst = max(float(top), float(column))
     beside = f", beside {space.faces[face]}" if column >= top and face >= SIDES else ""
     return Check(
-        "place of take-off", f"{coordinates((x, y), '.2f')} m, {shown(-worst, '.2f')} m inside{beside}",
+        "take-off position", f"{coordinates((x, y), '.2f')} m, {shown(-worst, '.2f')} m inside{beside}",
         "inside the space less its margin", bool(inside(worst)), "move the vehicle towards the middle of the room",
     )  # fmt: skip
 

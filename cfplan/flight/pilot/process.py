@@ -17,7 +17,9 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 
 from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.mocap.poses import PoseSource
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorMessage, HeldConductor, PilotMessage
 from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -42,22 +44,24 @@ class _Assignment:
     uri: str
     pose_source: PoseSource
     environment: Mapping[str, str]  # of the main process by now: a lab that started meanwhile stands there
+    conducted: bool  # it is a vehicle of a fleet
 
 
 class PilotProcess:
     """The pilot's process, which imports what it needs until it is assigned a mission; a context manager."""
 
     def __init__(self, process: BaseProcess, telemetry: Connection, orders: Connection, proposals: Connection):
-        self.process, self.telemetry, self.orders = process, telemetry, orders
+        self.process, self.telemetry = process, telemetry
+        self.orders = orders  # a fleet's conductor sends its messages here too, and hears those of the pilot
         self.proposals = proposals  # for a planner's process: it sends proposals, and hears answers
         self._assigned = False
 
-    def assign(self, mission: Mission, uri: str, pose_source: PoseSource) -> None:
-        """Let it fly. Raises LinkError if it has died."""
+    def assign(self, mission: Mission, uri: str, pose_source: PoseSource, *, conducted: bool = False) -> None:
+        """Let it fly, as a vehicle of a fleet if it is conducted. Raises LinkError if it has died."""
         try:
-            self.orders.send(_Assignment(mission, uri, pose_source, dict(os.environ)))
+            self.orders.send(_Assignment(mission, uri, pose_source, dict(os.environ), conducted))
         except OSError as why:
-            raise _died(self.process) from why
+            raise pilot_died(self.process) from why
         self._assigned = True
 
     def close(self) -> None:
@@ -82,7 +86,7 @@ def start_pilot(drivers: Sequence[type] = ()) -> PilotProcess:
     """Start the pilot's process, ahead of its mission. `drivers` are cflib link drivers tried before cflib's own."""
     context = multiprocessing.get_context("spawn")
     telemetry, telemetry_end = context.Pipe(duplex=False)
-    orders_end, orders = context.Pipe(duplex=False)
+    orders_end, orders = context.Pipe()
     proposals_end, proposals = context.Pipe()
     process = context.Process(
         target=_run, args=(tuple(drivers), telemetry_end, orders_end, proposals_end), name="pilot"
@@ -196,13 +200,13 @@ def _attend(process: BaseProcess, telemetry: Connection, attendant: Attendant) -
         try:
             message = telemetry.recv()
         except (EOFError, OSError):
-            raise _died(process) from attendant.failure
+            raise pilot_died(process) from attendant.failure
         if not isinstance(message, list):
             return attendant.conclude(message)
         attendant.tell(message)
 
 
-def _died(process: BaseProcess) -> LinkError:
+def pilot_died(process: BaseProcess) -> LinkError:
     process.join(5.0)
     return LinkError(
         f"the pilot's process died (exit code {process.exitcode})",
@@ -229,17 +233,24 @@ def _signals_ignored():
 
 
 class OrderReceiver(HeldOrders):
-    """Orders of the main process to the pilot, read by a thread; `gone` once reading has ended, for any reason."""
+    """Orders of the main process to the pilot, read by a thread; `gone` once reading has ended, for any reason.
 
-    def __init__(self, connection: Connection):
+    Messages of a fleet's conductor come the same way, for `conductor`.
+    """
+
+    def __init__(self, connection: Connection, conductor: HeldConductor | None = None):
         super().__init__()
-        self._connection = connection
+        self._connection, self._conductor = connection, conductor
         threading.Thread(target=self._run, name="orders", daemon=True).start()
 
     def _run(self) -> None:
         with contextlib.suppress(Exception):  # also after a message that is not an order: later ones cannot be trusted
             while True:
-                self.give(self._connection.recv())
+                message = self._connection.recv()
+                if self._conductor is not None and isinstance(message, ConductorMessage):
+                    self._conductor.give(message)
+                else:
+                    self.give(message)
         self.gone = True
 
 
@@ -259,7 +270,8 @@ def _run(
         os._exit(0)  # nothing is to be flown
     os.environ.update(assignment.environment)
     uri = assignment.uri
-    orders, report = OrderReceiver(orders_connection), Reporter(telemetry)
+    conductor = _conductor(orders_connection) if assignment.conducted else None
+    orders, report = OrderReceiver(orders_connection, conductor), Reporter(telemetry)
     signal.signal(signal.SIGTERM, lambda *_: orders.give(Order.LAND))
     sys.setswitchinterval(_SWITCH_INTERVAL)
     last: FlightOutcome | CfplanError
@@ -272,6 +284,7 @@ def _run(
             orders=orders,
             enter_real_time=_enter_real_time,
             proposals=ReceivedProposals(proposals),
+            conductor=conductor or NO_CONDUCTOR,
         )
         last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:
@@ -280,6 +293,16 @@ def _run(
         last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="please report this")
     report.close(last)
     os._exit(0)  # cflib leaves threads behind that never end
+
+
+def _conductor(connection: Connection) -> HeldConductor:
+    """Return the conductor at the other end of a connection."""
+
+    def tell(message: PilotMessage) -> None:
+        with contextlib.suppress(OSError):  # a main process that is gone is noticed by its orders
+            connection.send(message)
+
+    return HeldConductor(tell, REAL_CLOCK.now)
 
 
 def _enter_real_time() -> None:

@@ -54,7 +54,7 @@ class StreamedManoeuvres:
         loop = self._loop
         self._history.enter(Phase.GO_TO_START)
         start, yaw = self._mission.start
-        (x, y, z), _, yaw_above = loop.asked()
+        (x, y, z), _, yaw_above = loop.setpoint_now()
         duration = manoeuvre_time(math.dist(loop.pose().position, start), self._limits.ground.go_to_speed)
         way = loop.begin(self._way((x, y, z, yaw_above), (*start, yaw), duration))
         loop.until(lambda: loop.now() > way.end, math.inf)
@@ -63,6 +63,7 @@ class StreamedManoeuvres:
     def fly_plan(self) -> None:
         """Stream the plan, then hover for the mission's hold time; a new plan that comes meanwhile is flown too."""
         loop = self._loop
+        loop.await_clearance(Phase.STREAM)
         skipped = loop.skipped
         loop.begin_plan()
         while True:
@@ -119,8 +120,8 @@ class StreamedManoeuvres:
         pose = loop.pose()
         if loop.now() - pose.time > self._limits.pose.age_warning:
             return due
-        wanted = loop.wanted(pose.time)
-        if wanted is None or math.dist(pose.position, wanted) < _FOLLOWS_WITHIN:
+        setpoint_position = loop.setpoint_position(pose.time)
+        if setpoint_position is None or math.dist(pose.position, setpoint_position) < _FOLLOWS_WITHIN:
             return due
         nearest, least = due, math.inf
         for index in range(due, stream.first - 1, -1):

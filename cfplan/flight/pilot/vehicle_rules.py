@@ -23,13 +23,13 @@ At 1 mm, as Crazyswarm2 sets it, that bound spoils the gains where poses come no
 2 m/s the filter believes 0.1 m/s less, and the vehicle flies 6 cm off its plan.
 """
 EXTERNAL_ATTITUDE_STD = 5e-2  # rad, as Crazyswarm2 sets it: a filter that trusts attitude more has trouble with yaw
-GAIN_SHARE = 0.05
+GAIN_TOLERANCE_OF_FIRMWARE = 0.05
 """Share by which a gain may differ from the firmware's own; at a motor lag of 0.13 s it adds up to 0.3 cm."""
-TRADED_GAIN_SHARE = GAIN_TOLERANCE / (2.0 + GAIN_TOLERANCE)
+TRADED_GAIN_TOLERANCE = GAIN_TOLERANCE / (2.0 + GAIN_TOLERANCE)
 """The same for kR_xy and kw_xy, so that their ratio is within its tolerance; that adds up to 1 cm."""
-LEAST_TIME_ARMED = 5000  # ms: arming, its repeats and take-off fit into it
+MIN_ARMED_TIME = 5000  # ms: arming, its repeats and take-off fit into it
 _FULL_COMMAND = 65535  # of one motor
-_EQUAL = 1e-6  # share by which what is read back may differ: parameters are float32
+_FLOAT32_TOLERANCE = 1e-6  # share by which what is read back may differ: parameters are float32
 
 Interval = tuple[float, float]
 
@@ -49,7 +49,7 @@ class ParameterRule:
     allowed: Callable[
         [Limits], tuple[Interval, ...]
     ]  # the value lies in one of these; the first begins with the wanted
-    wanted: str  # the same in words
+    allowed_text: str  # the same in words
     action: Action
     reason: str  # one sentence
     hint: str  # what to do
@@ -67,8 +67,8 @@ class ParameterRule:
             return self.optional
         return any(
             (low <= value <= high)
-            or math.isclose(value, low, rel_tol=_EQUAL)
-            or math.isclose(value, high, rel_tol=_EQUAL)
+            or math.isclose(value, low, rel_tol=_FLOAT32_TOLERANCE)
+            or math.isclose(value, high, rel_tol=_FLOAT32_TOLERANCE)
             for low, high in self.allowed(limits)
         )
 
@@ -78,7 +78,7 @@ class ParameterRule:
         figures = " or ".join(
             _figures(each) for each in intervals if not any(_within(each, wide) for wide in intervals)
         )
-        words = self.wanted.replace("`", "")
+        words = self.allowed_text.replace("`", "")
         return f"{figures} ({words})" if any(map(str.isalpha, words)) else figures
 
 
@@ -139,7 +139,7 @@ _RESTART = "restart the vehicle; a value that comes back is stored in it and mus
 
 
 def _gain_rule(place: int, name: str) -> ParameterRule:
-    share = TRADED_GAIN_SHARE if name in ("ctrlMel.kR_xy", "ctrlMel.kw_xy") else GAIN_SHARE
+    share = TRADED_GAIN_TOLERANCE if name in ("ctrlMel.kR_xy", "ctrlMel.kw_xy") else GAIN_TOLERANCE_OF_FIRMWARE
     return ParameterRule(
         name, _gain(place, share), f"the firmware's own, within {100 * share:.2g} %", Action.REFUSED,
         _GAIN_REASONS.get(name, "The dry run and the fate after link loss are certified with this gain."),
@@ -164,8 +164,8 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
     ),
     ParameterRule(
         "ctrlMel.massThrust", _exactly(lambda limits: limits.airframe.command_per_thrust),
-        "65535 over the airframe's largest thrust", Action.SET,
-        "It turns N into motor commands, and depends on the motors.", "restart the vehicle",
+        "65535 over the thrust of all motors at full command", Action.SET,
+        "It turns N into motor commands, and depends on the motors and their `thrust_scale`.", "restart the vehicle",
     ),
     ParameterRule(
         "locSrv.extPosStdDev", _exactly(lambda _: EXTERNAL_POSITION_STD), "2 mm", Action.SET,
@@ -224,7 +224,7 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
         "restart the vehicle on a level floor and look at its console", optional=True,
     ),
     ParameterRule(
-        "supervisor.prefltTimeout", _always((LEAST_TIME_ARMED, math.inf)), f"at least {LEAST_TIME_ARMED} ms",
+        "supervisor.prefltTimeout", _always((MIN_ARMED_TIME, math.inf)), f"at least {MIN_ARMED_TIME} ms",
         Action.REFUSED,
         "An armed vehicle that does not take off in this time disarms itself.",
         _RESTART, since=(2025, 2), optional=True,

@@ -9,15 +9,15 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.crazyradio import usb_hint
 from cfplan.flight.radio.dongle import open_dongle
 from cfplan.flight.radio.link import Link
+from cfplan.flight.radio.parameter_tables import disk_table_cache
 from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.radio.restart import restart_vehicle
 from cfplan.flight.radio.session import Session
-from cfplan.flight.radio.table import tables_on_disk
 from cfplan.flight.radio.transport import DriverTransport, Transport, register_drivers
 from cfplan.flight.radio.uri import EXAMPLES
 from cfplan.flight.telemetry import Telemetry
 
-FIRST_ANSWER = 4.0  # s, from opening the link to the first answer
+FIRST_ANSWER_TIMEOUT = 4.0  # s, from opening the link to the first answer
 _LOOK_PERIOD = 0.02  # s
 
 
@@ -28,7 +28,7 @@ def connect(
     *,
     waiting: Callable[[], None] = lambda: None,
     clock: Clock = REAL_CLOCK,
-    patience: float = FIRST_ANSWER,
+    patience: float = FIRST_ANSWER_TIMEOUT,
 ) -> Link:
     """Connect, and end the state in which an earlier connection left the vehicle.
 
@@ -53,7 +53,7 @@ def connect(
 
 def _open(session: Session, patience: float) -> None:
     try:
-        session.open(patience, tables_on_disk())
+        session.open(patience, disk_table_cache())
     except LinkError as error:
         if session.lost:
             raise _unreachable(session.uri, session.lost) from error

@@ -42,13 +42,15 @@ def check_radio(uri: str) -> None:
         other = find_radios(OTHER_FIRMWARE) if not radios else []
         if other:
             raise LinkError(
-                "this Crazyradio 2.0 has other firmware than cflib speaks to",
+                "cflib does not support the firmware of this Crazyradio 2.0",
                 where=uri,
-                hint="give it the one that emulates a Crazyradio PA",
+                hint="flash the firmware that emulates a Crazyradio PA",
             )
         if radios:
             raise LinkError(
-                f"there is no radio {number}", where=uri, hint=f"they count from 0, and {len(radios)} are plugged in"
+                f"there is no radio {number}",
+                where=uri,
+                hint=f"radios are numbered from 0, and {len(radios)} are plugged in",
             )
         raise LinkError("no Crazyradio is plugged in", where=uri, hint="plug one in; `lsusb` lists it as 1915:7777")
     _take(radios[int(number)], uri)

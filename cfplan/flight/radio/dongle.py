@@ -11,7 +11,7 @@ from typing import Any
 
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.perishable import Outbox
-from cfplan.flight.radio.transport import Fail, Hear, hand_on
+from cfplan.flight.radio.transport import Fail, Hear, start_receiver
 
 PATIENCE = 0.005  # s that a packet waits for a busy radio; then it is dropped, as the next one is fresher
 DEAD_AFTER = 10.0  # s without an acknowledgement; a vehicle that hovers alone is worth waiting for
@@ -19,7 +19,7 @@ _UNANSWERED_PAUSE = (
     0.001  # s after a transmission that the dongle does not report on: one that is unplugged fails at once
 )
 _SAFELINK = bytes((0xFF, 0x05, 0x01))  # begins it; a vehicle that has it answers the same
-_TRIES = 10
+_SAFELINK_ATTEMPTS = 10
 _UP, _DOWN = 3, 2  # bits of the header with the counters
 _COUNTERS = 1 << _UP | 1 << _DOWN
 _NULL = 0xF3  # header of an empty packet, without the counters
@@ -33,7 +33,7 @@ class Dongle:
         """Take a `cflib.drivers.crazyradio.Crazyradio` that is tuned; `period`, s, is the least per transmission."""
         self._radio, self._clock, self._period = radio, clock, period
         self._outbox, self._changed = Outbox(), threading.Condition()
-        self._came: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self._ended = threading.Event()
         self._transmitting: threading.Thread | None = None
         self._fail: Fail = lambda _: None
@@ -42,7 +42,7 @@ class Dongle:
         self._fail = fail
         self._transmitting = threading.Thread(target=self._run, name="radio", daemon=True)
         self._transmitting.start()
-        hand_on(self._receive, hear, self._ended)
+        start_receiver(self._receive, hear, self._ended)
 
     def send(self, packet: bytes) -> None:
         with self._changed:
@@ -58,14 +58,14 @@ class Dongle:
 
     def _receive(self, wait: float) -> bytes | None:
         try:
-            return self._came.get(timeout=wait)
+            return self._received.get(timeout=wait)
         except queue.Empty:
             return None
 
     def _run(self) -> None:
         """Transmit without a pause, as the vehicle's packets come with acknowledgements alone."""
         try:
-            self._transmit(safelink=any(self._has_safelink() for _ in range(_TRIES)))
+            self._transmit(safelink=any(self._has_safelink() for _ in range(_SAFELINK_ATTEMPTS)))
         except Exception as error:  # pyusb raises what it likes
             self._fail(f"the Crazyradio failed: {error}")
 
@@ -98,7 +98,7 @@ class Dongle:
             if content and content[0] >> _DOWN & 1 == down:
                 down = 1 - down
             if content and content[0] & ~_COUNTERS != _NULL:
-                self._came.put(content)
+                self._received.put(content)
             empty = 0 if content else empty + 1
             with self._changed:
                 self._outbox.acknowledged()

@@ -18,7 +18,7 @@ from cfplan.vehicle.airframe import GRAVITY
 
 _MOTOR_TEST = "motorPowerSet.enable"
 _ANSWER_TIMEOUT = 2.0  # s
-_CLOSING = 2.0  # s that closing may take
+_CLOSE_TIMEOUT = 2.0  # s that closing may take
 
 _MILLI = 1e-3
 _CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ
@@ -57,7 +57,7 @@ class Link:
         self.motor_test = False  # a motor test overrides the controller, by the last answer to `ask_motor_test`
         self._motor_test = b""  # the number of its parameter, as packets have it, once it was asked for
         self._preflight_blocks: list[LogBlock] = []
-        self._revivals: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
+        self._log_recreation: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
         # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
         self._log_zero, self._log_heard = math.inf, 0.0
         session.listen(Port.HIGH_LEVEL, self._on_reply)
@@ -143,9 +143,9 @@ class Link:
         if number is not None:
             self._send(Port.PARAMETERS, WRITE_PARAMETER, struct.pack("<HB", number, 0))
 
-    def revive_log(self, name: str) -> None:
+    def recreate_log(self, name: str) -> None:
         """Send the next packet that creates `estimate` or `status` anew; call it each tick while that is silent."""
-        payload = next(self._revivals[name])
+        payload = next(self._log_recreation[name])
         if payload is not None:
             self._send(Port.LOG, SETTINGS_CHANNEL, payload)
 
@@ -187,7 +187,7 @@ class Link:
         for name, (variables, period_ms), note in (
             ("estimate", ESTIMATE_LOG, self._on_estimate), ("status", STATUS_LOG, self._on_status),
         ):  # fmt: skip
-            self._revivals[name] = self._session.start_log(variables, period_ms, note).revival()
+            self._log_recreation[name] = self._session.start_log(variables, period_ms, note).recreation()
         variables, period_ms = TARGET_LOG
         variables = variables + [each for each in TARGET_MODES if self.has_log_variable(each[0])]
         self._preflight_blocks = [
@@ -204,13 +204,13 @@ class Link:
         """Close the link. On the ground only: in the air nothing else reaches the vehicle."""
         closing = threading.Thread(target=self._session.close, daemon=True)  # a driver may wait for its thread
         closing.start()
-        closing.join(timeout=_CLOSING)
+        closing.join(timeout=_CLOSE_TIMEOUT)
         if self._radio_lock is not None:
             self._radio_lock.close()
 
     # Callbacks: these run in the transport's thread and must be quick.
 
-    def _when(self, stamp_ms: int) -> float:
+    def _written_at(self, stamp_ms: int) -> float:
         """Return when, s, the vehicle wrote a message: after a pause of the radio, old ones arrive."""
         now = self._clock.now()
         zero = now - stamp_ms * _MILLI
@@ -224,7 +224,7 @@ class Link:
         x, y, z, vx, vy, vz, ax, ay, az = (data[name] * _MILLI for name in _ESTIMATE)
         q = decompress_quaternion(np.array([data["stateEstimateZ.quat"]], dtype=np.uint32))[0]
         self.estimate = Estimate(
-            time=self._when(stamp_ms),
+            time=self._written_at(stamp_ms),
             position=(x, y, z),
             velocity=(vx, vy, vz),
             acceleration=(ax, ay, az - GRAVITY),  # the log counts gravity in
@@ -235,7 +235,7 @@ class Link:
     def _on_status(self, stamp_ms: int, data: dict[str, Any]) -> None:
         roll, pitch, yaw = (data[f"stateEstimateZ.{name}"] * _MILLI for name in ("rateRoll", "ratePitch", "rateYaw"))
         self.status = VehicleStatus(
-            time=self._when(stamp_ms),
+            time=self._written_at(stamp_ms),
             body_rate=(roll, -pitch, yaw),  # the log's pitch rate is nose up
             motor=(data["motor.m1"], data["motor.m2"], data["motor.m3"], data["motor.m4"]),
             battery_voltage=data["pm.vbatMV"] * _MILLI,

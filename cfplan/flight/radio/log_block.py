@@ -12,8 +12,8 @@ from typing import Any
 SETTINGS_CHANNEL, DATA_CHANNEL = 1, 2
 DELETE, RESET = 2, 5
 _STOP, _CREATE, _APPEND, _START = 4, 6, 7, 8
-_IN_ONE_PACKET = 9  # variables
-_TICKS_BETWEEN = 30  # from one attempt to the next
+_MAX_PER_PACKET = 9  # variables
+_RETRY_TICKS = 30  # from one attempt to the next
 _TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int16_t": (5, "h"), "float": (7, "f")}
 _HEAD = 4  # bytes of a message: number of the block, ms in 24 bits
 
@@ -29,19 +29,19 @@ class LogBlock:
     def creation(self) -> tuple[bytes, ...]:
         """Return the payloads that create the block and start it, in order; answers begin with the first two bytes."""
         entries = [struct.pack("<BH", _TYPES[kind][0], number) for _, kind, number in self.variables]
-        parts = [entries[at : at + _IN_ONE_PACKET] for at in range(0, len(entries), _IN_ONE_PACKET)]
+        parts = [entries[at : at + _MAX_PER_PACKET] for at in range(0, len(entries), _MAX_PER_PACKET)]
         commands = (_CREATE, *(_APPEND for _ in parts[1:]))
         made = tuple(
             bytes((command, self.number)) + b"".join(part) for command, part in zip(commands, parts, strict=True)
         )
         return *made, struct.pack("<BBH", _START, self.number, self.period_ms)
 
-    def revival(self) -> Iterator[bytes | None]:
+    def recreation(self) -> Iterator[bytes | None]:
         """Yield one payload a tick, without end; together they create the block anew, whether or not it exists.
 
         None stands for a tick without a packet, so that the log has time to come.
         """
-        return itertools.cycle((bytes((DELETE, self.number)), *self.creation(), *(None,) * _TICKS_BETWEEN))
+        return itertools.cycle((bytes((DELETE, self.number)), *self.creation(), *(None,) * _RETRY_TICKS))
 
     def stop(self) -> bytes:
         """Return the payload that stops the block."""

@@ -9,7 +9,7 @@ from cfplan.flight.radio.crtp import NULL_PACKET, Port
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE
 
 EXTERNAL_POSE = 8
-KEEPS_FOR = 0.05  # s; under heavy loss a packet is acknowledged sooner
+MAX_AGE = 0.05  # s; under heavy loss a packet is acknowledged sooner
 
 
 def is_perishable(packet: bytes) -> bool:
@@ -56,4 +56,4 @@ class Outbox:
 
 
 def _perished(put_at: float, packet: bytes, now: float) -> bool:
-    return now - put_at > KEEPS_FOR and is_perishable(packet)
+    return now - put_at > MAX_AGE and is_perishable(packet)

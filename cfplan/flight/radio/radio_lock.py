@@ -29,7 +29,7 @@ def lock_radio(uri: str) -> IO[str] | None:
     except OSError as error:
         file.close()
         raise LinkError(
-            "another cfplan is flying with it", where=uri, hint="wait until that has landed, or use a second radio"
+            "another cfplan process uses this link", where=uri, hint="wait until it has landed, or use a second radio"
         ) from error
     return file
 

@@ -7,7 +7,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 POWER_CHANNEL, POWER = 3, 0xFE
 SYSTEM_OFF, SYSTEM_ON = 2, 3
 BOOT = 1.0  # s from power on until it answers, at most
-_TRIES = 3
+_ATTEMPTS = 3
 
 
 def restart_vehicle(uri: str, clock: Clock = REAL_CLOCK) -> None:
@@ -17,7 +17,7 @@ def restart_vehicle(uri: str, clock: Clock = REAL_CLOCK) -> None:
     """
     from cflib.utils.power_switch import PowerSwitch
 
-    for left in reversed(range(_TRIES)):
+    for left in reversed(range(_ATTEMPTS)):
         try:
             switch = PowerSwitch(uri.partition("?")[0])
             try:

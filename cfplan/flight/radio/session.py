@@ -16,22 +16,22 @@ from cfplan.errors import LinkError
 from cfplan.flight.clock import Clock
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.log_block import DATA_CHANNEL, DELETE, RESET, SETTINGS_CHANNEL, LogBlock
-from cfplan.flight.radio.table import Table, Tables, read_table
+from cfplan.flight.radio.parameter_tables import Table, TableCache, read_table
 from cfplan.flight.radio.transport import Transport
 
-TABLES_WITHIN = 30.0  # s, from the first answer to the last table, over a lossy radio that reads each item
+TABLES_TIMEOUT = 30.0  # s, from the first answer to the last table, over a lossy radio that reads each item
 PING_PERIOD = 0.1  # s
 READ_PARAMETER, WRITE_PARAMETER = 1, 2  # channels
-_ASK_AGAIN = 0.2  # s
+_RETRY_PERIOD = 0.2  # s
 _LOOK_PERIOD = 0.02  # s between calls of `waiting`
-_PINGS_KEPT = 100  # for the round trip: 10 s
+_MAX_PINGS = 100  # for the round trip: 10 s
 _ECHO, _VERSION = 0, 1  # channels of the link and the platform port
 _PROTOCOL, _FIRMWARE = b"\0", b"\1"
 _MEMORY_INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
 _TRAJECTORY_MEMORY = 0x12  # type of memory
-_PART = 24  # bytes of memory in a packet
-_UPLOAD = 30.0  # s for 4,096 bytes there and back, which take some 340 packets
-_TRIES = 5  # to create a log
+_CHUNK = 24  # bytes of memory in a packet
+_UPLOAD_TIMEOUT = 30.0  # s for 4,096 bytes there and back, which take some 340 packets
+_LOG_ATTEMPTS = 5  # to create a log
 
 # Types of parameters as the table has them, with flags.
 _TYPE_MASK, _READ_ONLY = 0x0F, 0x40
@@ -52,20 +52,20 @@ class Session:
         self._transport, self._waiting = transport, waiting
         self._listeners: dict[int, Callable[[int, bytes], None]] = {}
         self._logs: dict[int, tuple[LogBlock, Callable[[int, dict[str, Any]], None]]] = {}
-        self._wanted: tuple[int, int, bytes] | None = None  # port, channel and beginning of the answer waited for
+        self._expected: tuple[int, int, bytes] | None = None  # port, channel and beginning of the answer waited for
         self._answer, self._answered = b"", threading.Event()
         self._pings: dict[bytes, float] = {}  # unanswered, each with the time, s, at which it was sent
-        self._round_trips: deque[float] = deque(maxlen=_PINGS_KEPT)
+        self._round_trips: deque[float] = deque(maxlen=_MAX_PINGS)
         self._pinged = 0
         transport.listen(self.hear, self.fail)
 
-    def open(self, patience: float, tables: Tables) -> None:
+    def open(self, patience: float, tables: TableCache) -> None:
         """Ask for versions and tables, and begin to ping.
 
         Raises LinkError if nothing answers for `patience`, s, or if the tables do not come within 30 s.
         """
         self.protocol = int.from_bytes(self.ask(Port.PLATFORM, _VERSION, _PROTOCOL, 1, patience)[1:2])
-        end = self.clock.now() + TABLES_WITHIN
+        end = self.clock.now() + TABLES_TIMEOUT
 
         def ask(port: Port, channel: int, payload: bytes, head: int) -> bytes:
             return self.ask(port, channel, payload, head, end - self.clock.now())
@@ -116,7 +116,7 @@ class Session:
         self._pinged += 1
         content = struct.pack("<BI", 0, self._pinged)
         self._pings[content] = self.clock.now()
-        if len(self._pings) > _PINGS_KEPT:
+        if len(self._pings) > _MAX_PINGS:
             del self._pings[next(iter(self._pings))]
         self.send(pack(Port.LINK, _ECHO, content))
         return PING_PERIOD
@@ -136,8 +136,8 @@ class Session:
                 self.acknowledged = self.clock.now()
                 self._round_trips.append(self.acknowledged - sent)
         else:
-            wanted = self._wanted
-            if wanted is not None and wanted[:2] == (port, channel) and payload.startswith(wanted[2]):
+            expected = self._expected
+            if expected is not None and expected[:2] == (port, channel) and payload.startswith(expected[2]):
                 self._answer = payload
                 self._answered.set()
             if port in self._listeners:
@@ -160,18 +160,18 @@ class Session:
         request, clock, now = pack(port, channel, payload), self.clock, self.clock.now()
         end = now + patience
         self._answered.clear()
-        self._wanted = port, channel, payload[:head]
+        self._expected = port, channel, payload[:head]
         try:
             while not self.lost and now < end:
                 self.send(request)
-                again = min(now + _ASK_AGAIN, end)
+                again = min(now + _RETRY_PERIOD, end)
                 while not self.lost and now < again:
                     self._waiting()
                     if clock.wait(self._answered, min(_LOOK_PERIOD, again - now)):
                         return self._answer
                     now = clock.now()
         finally:
-            self._wanted = None
+            self._expected = None
         if self.lost:
             raise LinkError(f"the link is lost: {self.lost}", where=self.uri, hint="check the radio link")
         raise LinkError(f"no answer to {what or port.name.lower()}", where=self.uri, hint="check the radio link")
@@ -201,7 +201,7 @@ class Session:
     def reset_logs(self) -> None:
         """Delete all log blocks of the vehicle, also those of an earlier session."""
         self._logs.clear()
-        self.ask(Port.LOG, SETTINGS_CHANNEL, bytes((RESET,)), 1, _ASK_AGAIN * _TRIES, "resetting the log")
+        self.ask(Port.LOG, SETTINGS_CHANNEL, bytes((RESET,)), 1, _RETRY_PERIOD * _LOG_ATTEMPTS, "resetting the log")
 
     def start_log(
         self, variables: Sequence[tuple[str, str]], period_ms: int, note: Callable[[int, dict[str, Any]], None]
@@ -216,16 +216,16 @@ class Session:
         entries = tuple((name, kind, self.log_variables[name][0]) for name, kind in variables)
         block = LogBlock(len(self._logs), period_ms, entries)
         self._logs[block.number] = block, note
-        for _ in range(_TRIES):
-            if all(self._obeys(payload) for payload in block.creation()):
+        for _ in range(_LOG_ATTEMPTS):
+            if all(self._run_log_command(payload) for payload in block.creation()):
                 return block
-            self._obeys(bytes((DELETE, block.number)))  # a part of it may be there
+            self._run_log_command(bytes((DELETE, block.number)))  # a part of it may be there
         raise LinkError("the vehicle does not create a log", where=self.uri, hint="check the radio link")
 
-    def _obeys(self, payload: bytes) -> bool:
+    def _run_log_command(self, payload: bytes) -> bool:
         """Send a command of the log once; return whether the vehicle answers that it is done."""
         try:
-            answer = self.ask(Port.LOG, SETTINGS_CHANNEL, payload, 2, _ASK_AGAIN)
+            answer = self.ask(Port.LOG, SETTINGS_CHANNEL, payload, 2, _RETRY_PERIOD)
         except LinkError:
             return False
         return answer[2:3] == b"\0"
@@ -235,7 +235,7 @@ class Session:
 
         Raises LinkError if the vehicle has no such memory, or does not take or give all of it within 30 s.
         """
-        end = self.clock.now() + _UPLOAD
+        end = self.clock.now() + _UPLOAD_TIMEOUT
 
         def ask(channel: int, payload: bytes, head: int, act: str) -> bytes:
             return self.ask(Port.MEMORY, channel, payload, head, end - self.clock.now(), f"{act} its memory")
@@ -245,7 +245,7 @@ class Session:
         number = next((found[1] for found in details if found[2:3] == bytes((_TRAJECTORY_MEMORY,))), None)
         if number is None:
             raise LinkError("the vehicle has no trajectory memory", where=self.uri, hint="update its firmware")
-        parts = {at: content[at : at + _PART] for at in range(0, len(content), _PART)}
+        parts = {at: content[at : at + _CHUNK] for at in range(0, len(content), _CHUNK)}
         held = b""
         for channel, act in ((_MEMORY_WRITE, "writing"), (_MEMORY_READ, "reading")):
             for at, part in parts.items():

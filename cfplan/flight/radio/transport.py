@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 _LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet checks whether it must end
-_SENDING = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
+_SEND_TIMEOUT = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
 
 Hear = Callable[[bytes], None]
 Fail = Callable[[str], None]
@@ -26,7 +26,7 @@ class Transport(Protocol):
         """End the link; may be called twice."""
 
 
-def hand_on(receive: Callable[[float], bytes | None], hear: Hear, ended: threading.Event) -> None:
+def start_receiver(receive: Callable[[float], bytes | None], hear: Hear, ended: threading.Event) -> None:
     """Call `hear` in a thread with each packet that `receive` returns, until `ended`; `receive` takes its patience, s.
 
     An exception in `hear` is logged, and the next packet heard: no packet may end a link.
@@ -62,12 +62,12 @@ class DriverTransport:
         self._fail = fail
         if self._failure:
             fail(self._failure)
-        hand_on(self._receive, hear, self._ended)
+        start_receiver(self._receive, hear, self._ended)
 
     def send(self, packet: bytes) -> None:
         from cflib.crtp.crtpstack import CRTPPacket
 
-        if not self._ended.is_set() and self._sending.acquire(timeout=_SENDING):
+        if not self._ended.is_set() and self._sending.acquire(timeout=_SEND_TIMEOUT):
             try:
                 self._driver.send_packet(CRTPPacket(packet[0], bytearray(packet[1:])))
             finally:

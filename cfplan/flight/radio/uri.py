@@ -18,12 +18,10 @@ def check_vehicle_uri(uri: str) -> None:
     elif kind in ("udp", "tcp"):
         port = _SOCKET.fullmatch(uri)
         if port is None or not 0 < int(port[1]) < 1 << 16:
-            raise InputError(
-                "a computer and its port are needed", where=uri, hint=f"write it as {kind}://127.0.0.1:19850"
-            )
+            raise InputError("host and port are needed", where=uri, hint=f"write it as {kind}://127.0.0.1:19850")
     elif kind == "usb":
         if not re.fullmatch(r"usb://\d+", uri):
-            raise InputError("the number of the vehicle on a cable is needed", where=uri, hint="write it as usb://0")
+            raise InputError("the number of the USB device is needed", where=uri, hint="write it as usb://0")
     elif kind == "sim":
         if not re.fullmatch(r"sim://\d{1,3}", uri):
             raise InputError("no such virtual vehicle", where=uri, hint="sim://0, sim://1, …")

@@ -197,10 +197,10 @@ def _compared(
         lean = math.acos(force[2] / length)
         made = attitude_rows(force, heading_of(quaternion[n]))
         off_z = thrust * wanted[0][2], thrust * wanted[1][2], thrust * wanted[2][2]
-        errors[0, n] = _off(_row(position, n), _row(asked[0], n))
-        errors[1, n] = _off(_row(velocity, n), _row(asked[1], n))
-        errors[2, n] = _off(_row(body_rate, n), (harmless[n, 0], harmless[n, 1], z))
-        errors[3, n] = _off(force, off_z)
+        errors[0, n] = _distance(_row(position, n), _row(asked[0], n))
+        errors[1, n] = _distance(_row(velocity, n), _row(asked[1], n))
+        errors[2, n] = _distance(_row(body_rate, n), (harmless[n, 0], harmless[n, 1], z))
+        errors[3, n] = _distance(force, off_z)
         errors[4, n] = _angle(matrix_rows(quaternion[n], 2.0), sent_rows(wanted))
         errors[5, n] = lean
         # The controller makes its attitude of thrust and yaw; an error of the quaternion turns yaw 1/cos(lean) as far.
@@ -298,7 +298,7 @@ def _row(values: NDArray, n: int) -> Vector:
 
 
 @register_jitable
-def _off(first: Vector, second: Vector) -> float:
+def _distance(first: Vector, second: Vector) -> float:
     """Return the largest difference of a component; NaN if one is NaN."""
     off_y = np.maximum(abs(first[1] - second[1]), abs(first[2] - second[2]))
     return np.maximum(abs(first[0] - second[0]), off_y)
@@ -341,8 +341,8 @@ def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: Plan
 def _require_hover(flown: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory) -> None:
     """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover at the end."""
     moves = np.abs(np.stack([flown.acceleration[-1], flown.body_rate[-1]])).max()
-    off = np.abs(flown.position[-1] - trajectory.at(np.array([trajectory.duration])).position[0]).max()
-    if flown.velocity[-1].any() or not moves <= 4 * HALF_QUANTUM or not off <= _ROUNDED:
+    error = np.abs(flown.position[-1] - trajectory.at(np.array([trajectory.duration])).position[0]).max()
+    if flown.velocity[-1].any() or not moves <= 4 * HALF_QUANTUM or not error <= _ROUNDED:
         raise NotCertifiedError(
             "the last setpoint is not a hover at the end of the path",
             where=f"setpoint {len(flown.position) - 1}",

@@ -68,7 +68,7 @@ _HEAD = struct.Struct("<8sIIQIII?")
 class Fault(StrEnum):
     """Why a proposal is refused."""
 
-    SHAPE = "the proposal is no setpoints with stops"
+    SHAPE = "the proposal does not consist of setpoints with stops"
     CHECKSUM = "the proposal is not what was certified: its checksum differs"
     ORDER = "the proposal continues another commitment than the present one"
     LATE = "the proposal came too late"
@@ -212,14 +212,14 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, limits: Limits)
     if not commitment.first <= proposal.splice <= now + FARTHEST_AHEAD:
         return Refusal(Fault.OUTSIDE, f"at setpoint {proposal.splice}, with {now} due")
     kept = min(proposal.splice, commitment.last) - commitment.first  # after its end the vehicle hovers
-    asked = decode(proposal.payloads)
+    proposed = decode(proposal.payloads)
     before = np.concatenate([commitment.payloads[np.maximum(kept + np.arange(-SPAN, 0), 0)], proposal.payloads])
     if refusal := (
-        _differs(decode(commitment.payloads[kept : kept + 1]), asked, proposal.splice)
+        _differs(decode(commitment.payloads[kept : kept + 1]), proposed, proposal.splice)
         or _moves_at_end(proposal)
-        or _unfit(proposal, before, limits)
-        or _unfit_stops(asked, proposal)
-        or _unfit_in_stops(proposal, before, limits)
+        or _find_fault(proposal, before, limits)
+        or _fault_of_stops(proposed, proposal)
+        or _fault_within_stops(proposal, before, limits)
     ):
         return refusal
     return spliced(commitment, proposal, now)
@@ -265,12 +265,12 @@ def _wrong_shape(first: int, payloads: NDArray, stops: NDArray) -> str:
     return ""
 
 
-def _differs(committed: FullStateSetpoints, asked: FullStateSetpoints, number: int) -> Refusal | None:
+def _differs(committed: FullStateSetpoints, proposed: FullStateSetpoints, number: int) -> Refusal | None:
     for name in ("position", "velocity", "acceleration", "body_rate"):
-        off = float(np.abs(getattr(asked, name)[0] - getattr(committed, name)[0]).max())
-        if off > QUANTUM + _ROUNDING:
-            return Refusal(Fault.JOINT, f"{name.replace('_', ' ')} at setpoint {number} is off by {off:.3f}")
-    turned = 2.0 * np.arccos(min(abs(float(asked.quaternion[0] @ committed.quaternion[0])), 1.0))
+        difference = float(np.abs(getattr(proposed, name)[0] - getattr(committed, name)[0]).max())
+        if difference > QUANTUM + _ROUNDING:
+            return Refusal(Fault.JOINT, f"{name.replace('_', ' ')} at setpoint {number} is off by {difference:.3f}")
+    turned = 2.0 * np.arccos(min(abs(float(proposed.quaternion[0] @ committed.quaternion[0])), 1.0))
     if turned > 2.0 * ATTITUDE_QUANTUM:
         return Refusal(Fault.JOINT, f"attitude at setpoint {number} is off by {np.degrees(turned):.2f}°")
     return None
@@ -282,24 +282,24 @@ def _moves_at_end(proposal: Proposal) -> Refusal | None:
     return Refusal(Fault.END, f"setpoint {proposal.splice + len(proposal.payloads) - 1} still moves")
 
 
-def _unfit(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
+def _find_fault(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
     """Return why the setpoints must not be flown; the stop at their end is judged with the other stops."""
     end = max(len(proposal.payloads) - (proposal.ending + 1 if proposal.ending else 0), 1)
-    if found := _first_wrong(proposal.payloads[None], before, end, limits, in_stop=False):
+    if found := _first_excess(proposal.payloads[None], before, end, limits, in_stop=False):
         fault, what, _, row = found
         return Refusal(fault, f"setpoint {proposal.splice + row} {what}")
     return None
 
 
-def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | None:
+def _fault_of_stops(proposed: FullStateSetpoints, proposal: Proposal) -> Refusal | None:
     """Return which stop does not begin at its setpoint or end at rest, or does not agree with the last setpoints."""
     stops, first, count = proposal.stops, proposal.splice, len(proposal.payloads)
     begin, end = decode(stops[:, 0]), decode(stops[:, -1])
-    off = np.maximum(
-        np.abs(begin.position - asked.position).max(axis=1), np.abs(begin.velocity - asked.velocity).max(axis=1)
+    difference = np.maximum(
+        np.abs(begin.position - proposed.position).max(axis=1), np.abs(begin.velocity - proposed.velocity).max(axis=1)
     )
-    turned = np.abs(np.remainder(yaw_of(begin.quaternion.T) - yaw_of(asked.quaternion.T) + np.pi, 2 * np.pi) - np.pi)
-    good = (off <= QUANTUM + _ROUNDING) & (turned <= _SAME_HEADING) & _rests(end)
+    turned = np.abs(np.remainder(yaw_of(begin.quaternion.T) - yaw_of(proposed.quaternion.T) + np.pi, 2 * np.pi) - np.pi)
+    good = (difference <= QUANTUM + _ROUNDING) & (turned <= _SAME_HEADING) & _rests(end)
     if not good.all():
         return Refusal(Fault.STOPS, f"the stop from setpoint {first + int(np.argmin(good))}")
     last = count - proposal.ending - 1
@@ -309,16 +309,16 @@ def _unfit_stops(asked: FullStateSetpoints, proposal: Proposal) -> Refusal | Non
     return None
 
 
-def _unfit_in_stops(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
+def _fault_within_stops(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
     """Return why the stops must not be flown."""
     stops = proposal.stops
-    if found := _first_wrong(stops, before, stops.shape[1], limits, in_stop=True):
+    if found := _first_excess(stops, before, stops.shape[1], limits, in_stop=True):
         fault, what, number, row = found
         return Refusal(fault, f"setpoint {row} of the stop from setpoint {proposal.splice + number} {what}")
     return None
 
 
-def _first_wrong(
+def _first_excess(
     runs: NDArray, before: NDArray, end: int, limits: Limits, *, in_stop: bool
 ) -> tuple[Fault, str, int, int] | None:
     """Return the first fault in the rows before `end` of runs, (R, L, 29): its kind, its text, its run and its row."""
@@ -326,7 +326,7 @@ def _first_wrong(
     def wrong(first: int, count: int, rows: int) -> tuple[Fault, str] | None:
         some = runs[first : first + count]
         worst = motion_extremes(some, before[first:], limits.airframe, end=rows)
-        return _wrong(worst, some[:, :rows], limits, in_stop=in_stop)
+        return _excess_text(worst, some[:, :rows], limits, in_stop=in_stop)
 
     if not wrong(0, len(runs), end):
         return None
@@ -336,7 +336,7 @@ def _first_wrong(
     return None if found is None else (*found, run, row)
 
 
-def _wrong(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
+def _excess_text(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
     """Return kind and text of the fault in runs of setpoints, by their worst values; None if there is no fault."""
     # Stops lie on the chords between setpoints, where each position is off by acceleration times period² / 8 at most.
     chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0

@@ -24,16 +24,16 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of
 
 _CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
-_QUICK = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
+_QUICK_ACCELERATION = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
 # m above the floor, and m/s²: below that, a vehicle that has just braked sinks on more gently. Its controller asks for
 # less thrust than the setpoint does; with 3 m/s² it stopped all motors, and without thrust the vehicle turned by 40°.
-_LOW, _GENTLY = 0.6, 1.0
-_OFF_WALLS = 1.0  # m from a wall, nearer than which a vehicle without poses goes off it
+_GENTLE_BELOW, _GENTLE_ACCELERATION = 0.6, 1.0
+_WALL_DISTANCE = 1.0  # m from a wall, nearer than which a vehicle without poses goes off it
 _ASIDE_MAX = 0.4  # m that it goes along x or y for that in one stop or descent
 _ASIDE_ACCELERATION = 1.5  # m/s², of a descent sideways: a tilt of 9°
 _STOP_ASIDE_ACCELERATION = 3.0  # m/s², of a stop's setpoints, which the vehicle does not follow as fast
 _BY_SMOOTHSTEP = 10.0 / math.sqrt(3.0)  # acceleration of a quintic smoothstep, for a way of 1 m in 1 s
-_CALM = 0.1  # m above the floor, below which a descent only sinks
+_MIN_HEIGHT_ASIDE = 0.1  # m above the floor, below which a descent only sinks
 
 _Sideways = tuple[NDArray, NDArray, NDArray]
 
@@ -59,7 +59,7 @@ def gentle(mean_speed: float) -> Pace:
 
 
 # Without poses: as fast as what falls from 0.2 m, and where the floor may be, as what falls from 2 cm.
-QUICK = Pace(2.0, acceleration=_QUICK, touch_speed=0.6, slow_above=0.1)
+QUICK = Pace(2.0, acceleration=_QUICK_ACCELERATION, touch_speed=0.6, slow_above=0.1)
 
 
 def descent(
@@ -81,16 +81,16 @@ def descent(
     """
     heights, speeds = [begin[2]], [max(speed_now, 0.0)]
     while heights[-1] > lowest:
-        quickest = _GENTLY if heights[-1] - floor < _LOW else _QUICK
-        faster = min(speeds[-1] + min(pace.acceleration, quickest) / rate, pace.at(heights[-1] - floor))
-        speeds.append(max(faster, speeds[-1] - _QUICK / rate))
+        limit = _GENTLE_ACCELERATION if heights[-1] - floor < _GENTLE_BELOW else _QUICK_ACCELERATION
+        faster = min(speeds[-1] + min(pace.acceleration, limit) / rate, pace.at(heights[-1] - floor))
+        speeds.append(max(faster, speeds[-1] - _QUICK_ACCELERATION / rate))
         heights.append(max(heights[-1] - speeds[-1] / rate, lowest))
     count = len(heights) + 1
     position, velocity, change = np.tile(begin, (count, 1)), np.zeros((count, 3)), np.zeros((count, 3))
     position[:, 2] = [*heights, heights[-1]]
     velocity[:-1, 2] = -np.array(speeds)
     change[:-2, 2] = -np.diff(speeds) * rate
-    above = sum(height - floor > _CALM for height in heights)
+    above = sum(height - floor > _MIN_HEIGHT_ASIDE for height in heights)
     sideways = _sideways(aside, above, count, rate, _ASIDE_ACCELERATION)
     position[:, :2] += sideways[0]
     velocity[:, :2], change[:, :2] = sideways[1:]
@@ -105,7 +105,7 @@ def descent(
 def off_walls(position: Triple, space: Space) -> tuple[float, float]:
     """Return the way, x and y in m, that leads a vehicle at a position, m, off the walls nearby; not at an obstacle."""
     x, y = (
-        min(max(_clear(place, low, high) - place, -_ASIDE_MAX), _ASIDE_MAX)
+        min(max(_away_from_walls(place, low, high) - place, -_ASIDE_MAX), _ASIDE_MAX)
         for place, low, high in zip(position[:2], space.low[:2], space.high[:2], strict=True)
     )
     height = max(position[2] - space.low[2], 0.0)
@@ -114,10 +114,10 @@ def off_walls(position: Triple, space: Space) -> tuple[float, float]:
     return (x, y) if inside(space.beyond(middle, half)[SIDES:]).all() else (0.0, 0.0)
 
 
-def _clear(place: float, low: float, high: float) -> float:
+def _away_from_walls(place: float, low: float, high: float) -> float:
     """Return the nearest place that is far enough from two opposite walls, or the middle between them."""
-    off = min(_OFF_WALLS, 0.5 * (high - low))
-    return min(max(place, low + off), high - off)
+    clearance = min(_WALL_DISTANCE, 0.5 * (high - low))
+    return min(max(place, low + clearance), high - clearance)
 
 
 def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, acceleration: float) -> _Sideways:
@@ -146,8 +146,8 @@ def sinking(payloads: NDArray, lowest: float, speed: float, rate: float, space: 
     room = max(float(motion.position[:, 2].min()) - lowest, 0.0)
     depth, fall = np.zeros((len(payloads), 3)), np.zeros((len(payloads), 3))
     for row in range(1, len(payloads)):
-        allowed = min(speed, math.sqrt(2.0 * _QUICK * (room - depth[row - 1, 2])))
-        fall[row, 2] = min(fall[row - 1, 2] + _QUICK / rate, allowed)
+        allowed = min(speed, math.sqrt(2.0 * _QUICK_ACCELERATION * (room - depth[row - 1, 2])))
+        fall[row, 2] = min(fall[row - 1, 2] + _QUICK_ACCELERATION / rate, allowed)
         depth[row, 2] = min(depth[row - 1, 2] + fall[row, 2] / rate, room)
     x, y, z = motion.position[-1].tolist()
     aside, rows = off_walls((x, y, z), space), len(payloads)

@@ -31,7 +31,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import Vector, cross, dot, heading_of
 
 SPAN = 2  # setpoints before and after one whose velocities give its acceleration
-_LARGE = 1e9  # in place of NaN and of larger values
+_REPLACEMENT = 1e9  # in place of NaN and of larger values
 _PLACE, _SPEED, _FORCE, _RATE = FIELD_PLACES  # bytes at which position, velocity, acceleration and body rate begin
 # Rows of the running maxima: the measures, then other values; those whose minimum counts are negated.
 _LEAST_THRUST, _TRADED, _JUMP, _TURNED = of.MEASURES, of.MEASURES + 1, of.MEASURES + 2, of.MEASURES + 3
@@ -61,7 +61,7 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
 
     Run r follows the setpoints r to r + SPAN of `before`, (R + SPAN, 29) or more; its last row is repeated behind it.
     """
-    worst = np.full(_ROWS, -_LARGE)
+    worst = np.full(_ROWS, -_REPLACEMENT)
     vehicle = _Vehicle(airframe.drag[0] / airframe.mass, FIRMWARE_GAINS.full_rate, moment_rates(airframe))
     _raise_by_runs(worst, _read_only(runs), _read_only(before), runs.shape[1] if end is None else end, vehicle)
     high = worst[: of.MEASURES].copy()
@@ -216,4 +216,4 @@ def _milli(payload: NDArray, place: int) -> float:
 @register_jitable(forceinline=True)
 def _raise(worst: NDArray, row: int, value: float) -> None:
     """Update a running maximum; NaN is larger than any number."""
-    worst[row] = max(worst[row], value if value < _LARGE else _LARGE)
+    worst[row] = max(worst[row], value if value < _REPLACEMENT else _REPLACEMENT)

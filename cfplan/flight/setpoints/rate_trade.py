@@ -90,7 +90,8 @@ def moment_rates(airframe: Airframe) -> tuple[float, float]:
 
     The controller adds kw/2 to two motors and takes it from the others, in 16-bit units, for each rad/s.
     """
-    torque = FIRMWARE_GAINS.kw_xy * airframe.arm / (2.0 * airframe.command_per_thrust)  # N m for each rad/s
+    per_thrust = airframe.command_per_thrust / (1.0 - airframe.thrust_curvature)  # of a change around hover
+    torque = FIRMWARE_GAINS.kw_xy * airframe.arm / (2.0 * per_thrust)  # N m for each rad/s
     about_x, about_y = airframe.velocity_moment
     return -about_x / torque, about_y / torque
 

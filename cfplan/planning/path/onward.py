@@ -28,7 +28,7 @@ from cfplan.vehicle.trajectory import Trajectory
 WEIGHTS = (1.0, 10.0, 100.0)  # of the excess over soft limits, in successive descents
 SOFT_STEPS, SOFT_TOLERANCE = 40, 2e-3  # of descents with soft limits; the tolerance is a fraction of the cost
 STEPS, TOLERANCE = 2, 2e-3  # of descents of the flight time; four more steps gain 0.5 % and take 50 % longer
-_GENTLY = 0.7  # fraction of the limit on acceleration that is assumed in initial paths
+_ASSUMED_ACCELERATION = 0.7  # fraction of the limit on acceleration that is assumed in initial paths
 _SOON = 0.1  # s, the shortest segment of an initial path
 _SAME = 1e-9  # fraction of a path's end, within which two of its places count as one
 _INSIDE = 0.05  # m inside the margin, for points of an initial path
@@ -138,7 +138,7 @@ def along(
 
 
 def _gain(limits: Limits) -> float:
-    return _GENTLY * limits.plan.acceleration
+    return _ASSUMED_ACCELERATION * limits.plan.acceleration
 
 
 def _times(points: NDArray, velocity: NDArray, limits: Limits) -> NDArray:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cfplan.safety.space import SIDES, Box, Obstacle, Space
 
-_BESIDE = 0.15  # m, added to the margin of obstacles where link loss must end clear of them
+_LINK_LOSS_CLEARANCE = 0.15  # m, added to the margin of obstacles where link loss must end clear of them
 _MOVED = 1e-6  # m, step of finite differences
 
 
@@ -30,7 +30,7 @@ class Room:
             column = _column(each, self.space)
             alone = replace(self.space, obstacles=(column,))
             columns.append(column if alone.holds(self.waypoints) else each)
-        return replace(self, space=replace(self.space, obstacles=tuple(columns)), beside=_BESIDE)
+        return replace(self, space=replace(self.space, obstacles=tuple(columns)), beside=_LINK_LOSS_CLEARANCE)
 
     def beyond(self, positions: NDArray, leg: NDArray) -> NDArray:
         """Return how far positions, (P, 3) m, are beyond each face and side, (P, F) m; negative inside."""

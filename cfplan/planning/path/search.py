@@ -30,7 +30,9 @@ LOOSE_TOLERANCE = 0.01  # the same of a first descent, by the length of the path
 # Weights of what leaves the room, s/m³: each descent that ends outside is followed by one with the next weight, which
 # keeps further inside by what was missed.
 WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
-_GENTLY = 0.5  # of the limit on acceleration, with which speeds change in the times that a search begins with
+_ASSUMED_ACCELERATION = (
+    0.5  # of the limit on acceleration, with which speeds change in the times that a search begins with
+)
 RESERVE = 0.002  # m, kept inside beyond what was missed
 
 
@@ -60,7 +62,7 @@ def times_as_flown(points: NDArray, limits: PlanLimits) -> NDArray:
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
     ahead = steps / lengths[:, None]
-    gain = _GENTLY * limits.acceleration
+    gain = _ASSUMED_ACCELERATION * limits.acceleration
     speeds = np.zeros(len(points))
     speeds[1:-1] = limits.speed * np.sqrt(np.maximum((1.0 + (ahead[1:] * ahead[:-1]).sum(axis=1)) / 2.0, 0.0))
     for order in (range(len(lengths)), range(len(lengths) - 1, -1, -1)):

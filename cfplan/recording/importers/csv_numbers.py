@@ -80,7 +80,7 @@ def _mistake(
                 hint = "export it again, or leave the cell empty: not seen"
                 return InputError(message, where=f"{where}:{number}", hint=hint)
     return InputError(
-        "the numbers behind this line cannot be read",
+        "the numbers after this line cannot be read",
         where=f"{where}:{line_at(data, begin)}",
         hint="export the log again, with plain decimal numbers and without quotes",
     )

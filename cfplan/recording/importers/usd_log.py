@@ -25,7 +25,7 @@ from cfplan.recording.importers.mocap_log import PLACE, POSE, Columns, MocapLog,
 FORMAT = "Crazyflie microSD log"
 HEAD = re.compile(rb"\xbc[\0-\x0f]\0|[\1-\x40]tick\(I\),")  # the first byte, and a small version; or a small width
 _MAGIC = 0xBC
-_MOST = 64  # event types, and variables of one; the firmware allows 20
+_MAX_EVENT_TYPES = 64  # event types, and variables of one; the firmware allows 20
 _CLOCKS = {1: ("<u4", 1e-3), 2: ("<u8", 1e-6)}  # version: type of a time, and its unit in s
 _CODES = {"B": "u1", "b": "i1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4", "e": "<f2"}
 _PLACE: Columns = {axis: (axis, 1.0) for axis in PLACE}
@@ -131,7 +131,7 @@ def _blocks(data: bytes, file: Path) -> tuple[float, list[tuple[str, NDArray]], 
         if not blocks:
             raise ValueError
     except (ValueError, KeyError) as error:
-        raise InputError(f"damaged behind byte {begin}", where=str(file), hint="copy it from the card again") from error
+        raise InputError(f"damaged after byte {begin}", where=str(file), hint="copy it from the card again") from error
     rest = data[begin + 1 : end]
     rows = np.frombuffer(b"".join([*blocks[1:], rest[: len(rest) // row.itemsize * row.itemsize]]), row)
     return 1e-3, [("fixedFrequency", rows)], begin < len(data)
@@ -168,9 +168,9 @@ def _head(data: bytes, file: Path) -> tuple[float, dict[int, tuple[str, np.dtype
             raise InputError(message, where=str(file), hint=hint)
         clock, unit = _CLOCKS[version]
         types = {}
-        for _ in range(number(_MOST)):
+        for _ in range(number(_MAX_EVENT_TYPES)):
             key, name = number(), text()
-            types[key] = name, _row(clock, [text() for _ in range(number(_MOST))])
+            types[key] = name, _row(clock, [text() for _ in range(number(_MAX_EVENT_TYPES))])
     except (struct.error, ValueError, KeyError) as error:
         message = f"the head of the log is damaged or cut off at byte {offset}"
         raise InputError(message, where=str(file), hint="copy it from the card again") from error

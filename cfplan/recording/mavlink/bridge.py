@@ -30,7 +30,7 @@ _LARGEST_DATAGRAM = 2048  # bytes; MAVLink's are never longer
 _DATAGRAMS_AT_ONCE = 50  # before it is time to send again
 _SHORTEST_WAIT, _LONGEST_WAIT = 0.001, 0.1  # s between two looks at what is due
 _FLUSH_PERIOD = 1.0  # s, of the .tlog
-_GOODBYE = 2.0  # s that the end of a flight waits for the last packets
+_CLOSE_TIMEOUT = 2.0  # s that the end of a flight waits for the last packets
 _SEVERITY = {Level.INFO: 6, Level.WARNING: 4, Level.ERROR: 3}  # MAV_SEVERITY
 _WARNING = 4
 _FORM = "as in udp:127.0.0.1:14550, where the ground station listens"
@@ -101,14 +101,14 @@ class GroundStation:
         self._serving: Repeated | None = None
 
     def __enter__(self) -> "GroundStation":
-        self._serving = self._clock.repeat(self._serve, name="mavlink", last=self._say_goodbye, wake=self._socket)
+        self._serving = self._clock.repeat(self._serve, name="mavlink", last=self._send_last, wake=self._socket)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._serving is not None:
-            self._serving.stop(_GOODBYE)
+            self._serving.stop(_CLOSE_TIMEOUT)
         self._socket.close()
         if self._log is not None:
             with contextlib.suppress(OSError):
@@ -151,7 +151,7 @@ class GroundStation:
                 self._fail(f"fault in MAVLink: {error!r}")
         return min(_LONGEST_WAIT, max(_SHORTEST_WAIT, min(self._due) - self._clock.now()))
 
-    def _say_goodbye(self) -> None:
+    def _send_last(self) -> None:
         with contextlib.suppress(Exception):
             self._send_texts()
             self._mav.send(messages.heartbeat(self._mav, self._latest))

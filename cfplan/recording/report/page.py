@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfplan.files.whole import check_new_file, write_whole
+from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.flight.telemetry import Level
 from cfplan.recording.overlay import Trial, short_name, trial_of_record
 from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
@@ -62,7 +62,7 @@ def html_page(title: str, body: str, version: str) -> str:
 def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
     """Write the page atomically. Raises InputError if the file cannot be written."""
     check_new_file(file, overwrite=overwrite)
-    write_whole(file, page(flights).encode())
+    write_atomically(file, page(flights).encode())
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:

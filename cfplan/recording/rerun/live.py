@@ -31,13 +31,14 @@ from cfplan.recording.rerun.record_view import (
     log_tail,
 )
 from cfplan.recording.rerun.viewer import APPLICATION, free_port, lay_out, require_screen, viewer_program
+from cfplan.recording.summary import reference_times
 from cfplan.recording.topics import TOPICS, columns_of
 
 PERIOD = 0.1  # s between batches
 CAPACITY = 50_000  # messages that wait at most; more are left out of the view, never of the record
 # Of these the last of a batch begins the next, so that lines have no gaps.
 _CARRIED = (SetpointSent, PoseReceived, VehicleStatus)
-_GOODBYE = 3.0  # s
+_CLOSE_TIMEOUT = 3.0  # s
 
 
 def open_live(header: RecordHeader, folder: Path) -> "LiveView":
@@ -88,7 +89,7 @@ class LiveView:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._sending is not None:
-            self._sending.stop(_GOODBYE)
+            self._sending.stop(_CLOSE_TIMEOUT)
 
     def show(self, message: Telemetry) -> None:
         """Take a message."""
@@ -107,7 +108,7 @@ class LiveView:
     def _end(self) -> None:
         if not self.failure and self._show_waiting() is not None:
             with contextlib.suppress(Exception):
-                self._stream.flush(timeout_sec=_GOODBYE / 2)
+                self._stream.flush(timeout_sec=_CLOSE_TIMEOUT / 2)
         with contextlib.suppress(Exception):
             self._stream.disconnect()
 
@@ -137,7 +138,8 @@ class LiveView:
         log_limits(self._stream, shown, [end - self._start for end in ends])
         poses = part.poses
         log_tail(self._stream, layout.FLOWN, poses.time - self._start, poses.position, FLOWN, TRACK_RADIUS)
-        for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, part.setpoints.due, WANTED)):
+        wanted = reference_times(part.setpoints)
+        for entity, times, colour in ((layout.BODY, poses.time, FLOWN), (layout.GHOST, wanted, WANTED)):
             if len(times) and entity not in self._drawn:
                 self._drawn.add(entity)
                 log_outline(self._stream, entity, self._header.vehicle.arm, times[:1] - self._start, colour)

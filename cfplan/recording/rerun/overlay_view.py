@@ -32,7 +32,7 @@ MOST_DASHES = 20_000
 DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, as they could not be distinguished
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
 _AXES = "xyz"
-_HIGHER = 1.25  # times as far as in the view of one record, which is less high for its width
+_CAMERA_DISTANCE_FACTOR = 1.25  # times as far as in the view of one record, which is less high for its width
 
 
 def write_overlay(trials: Sequence[Trial], file: Path, *, overwrite: bool = False) -> None:
@@ -79,7 +79,9 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
 def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
     low, high = extent(trials)
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
-    aside = _HIGHER * np.array(layout.LONG_IN_Y if high[1] - low[1] > high[0] - low[0] else layout.LONG_IN_X)
+    aside = _CAMERA_DISTANCE_FACTOR * np.array(
+        layout.LONG_IN_Y if high[1] - low[1] > high[0] - low[0] else layout.LONG_IN_X
+    )
     return rrb.Spatial3DView(
         origin=WORLD,
         name="Trials",

@@ -13,14 +13,14 @@ from typing import Any
 import rerun.blueprint as rrb
 
 from cfplan.errors import InputError
-from cfplan.files.whole import check_new_file, whole_file
+from cfplan.files.atomic import atomic_output, check_new_file
 from cfplan.recording.rerun.layout import TIMELINE
 from cfplan.recording.rerun.viewer import Draw, free_port, save, viewer_program
 
 SIZE = (1920, 1080)  # points, of the window that is never shown
-_STARTS_WITHIN = 30.0  # s
-_LOADS_WITHIN = 60.0  # s
-_SETTLES = 5.0  # s until plots have found their ranges and the viewer no longer says hello
+_START_TIMEOUT = 30.0  # s
+_LOAD_TIMEOUT = 60.0  # s
+_SETTLE_TIME = 5.0  # s until plots have found their ranges and the viewer no longer says hello
 _NO_DRIVER_WORDS = ("No graphics adapter", "Failed to get render context", "Vulkan")
 
 
@@ -48,7 +48,7 @@ def write_png(
             viewer.go_to(moment)
             picture = viewer.picture()
             complaints = viewer.complaints()
-    with whole_file(file) as unfinished:
+    with atomic_output(file) as unfinished:
         unfinished.write_bytes(picture)
     return complaints
 
@@ -85,7 +85,7 @@ class HeadlessViewer:
 
     def _open(self, recording: Path) -> None:
         self._client.open(str(recording))
-        end = time.monotonic() + _LOADS_WITHIN
+        end = time.monotonic() + _LOAD_TIMEOUT
         while self._client.get_state().loading:
             if time.monotonic() > end:
                 raise InputError(
@@ -98,7 +98,7 @@ class HeadlessViewer:
     def go_to(self, moment: float) -> None:
         """Set the time cursor, s."""
         self._client.set_time(TIMELINE, duration=moment)
-        time.sleep(_SETTLES)
+        time.sleep(_SETTLE_TIME)
 
     def views(self) -> tuple[View, ...]:
         """Return all views of the window, those behind others in tabs too."""
@@ -122,7 +122,7 @@ def _client(port: int, process: subprocess.Popen) -> Any:
     """Connect once the viewer listens. Raises ConnectionError where it does not, or ends instead."""
     from rerun.experimental import ViewerClient
 
-    end = time.monotonic() + _STARTS_WITHIN
+    end = time.monotonic() + _START_TIMEOUT
     while True:
         try:
             client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")

@@ -28,7 +28,7 @@ from cfplan.recording.rerun.picture import write_png
 from cfplan.recording.rerun.plan_view import log_plan
 from cfplan.recording.rerun.states import PHASE_COLOURS, SUPERVISOR_COLOURS, supervisor_states
 from cfplan.recording.rerun.viewer import open_viewer, save
-from cfplan.recording.summary import dropouts, pose_gaps, reference_span, summary_text
+from cfplan.recording.summary import dropouts, pose_gaps, reference_span, reference_times, summary_text
 from cfplan.safety.space import Box, Cylinder
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z
@@ -94,7 +94,7 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
     _log_whole_track(stream, record)
     for entity, times, colour in (
         (layout.BODY, record.poses.time, FLOWN_COLOUR),
-        (layout.GHOST, record.setpoints.due, WANTED_COLOUR),
+        (layout.GHOST, reference_times(record.setpoints), WANTED_COLOUR),
     ):
         if len(times):
             log_outline(stream, entity, record.header.vehicle.arm, times - record.start, colour)
@@ -170,11 +170,11 @@ def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot
     setpoints = replace(record.setpoints, quaternion=meant_motion(record.setpoints)[0])  # not that of the packets
     for entity, tail, times, moving, colour, radius in (
         (layout.BODY, layout.TAIL, poses.time, poses, FLOWN_COLOUR, TAIL_RADIUS),
-        (layout.GHOST, layout.WANTED_TAIL, setpoints.due, setpoints, WANTED_COLOUR, WANTED_RADIUS),
+        (layout.GHOST, layout.WANTED_TAIL, reference_times(setpoints), setpoints, WANTED_COLOUR, WANTED_RADIUS),
     ):
         if len(times):
             columns = rr.Transform3D.columns(translation=moving.position, quaternion=moving.quaternion)
-            stream.send_columns(entity, [_since(start, times)], columns, strict=True)
+            stream.send_columns(entity, [_time_column(start, times)], columns, strict=True)
             log_tail(stream, tail, times - start, moving.position, colour, radius)
     _log_thrust(stream, record, start)
     for plot in shown:
@@ -183,7 +183,7 @@ def log_columns(stream: rr.RecordingStream, record: Record, shown: Sequence[Plot
                 values = rr.Scalars.columns(scalars=line.values.reshape(-1))
                 columns = values.partition([len(line.labels)] * len(line.time))
                 entity = f"{layout.PLOTS}/{plot.name}/{line.name}"
-                stream.send_columns(entity, [_since(start, line.time)], columns, strict=True)
+                stream.send_columns(entity, [_time_column(start, line.time)], columns, strict=True)
     _log_states(stream, record, start)
     _log_events(stream, record, start)
     _log_commitments(stream, record, start)
@@ -205,7 +205,7 @@ def _log_thrust(stream: rr.RecordingStream, record: Record, start: float) -> Non
     seen = (status.time >= poses.time[0]) & (status.time <= poses.time[-1])
     length = motor_thrust(record)[seen].sum(axis=1) / (record.header.vehicle.mass * GRAVITY) * HOVER_ARROW
     columns = rr.Arrows3D.columns(vectors=np.stack([0 * length, 0 * length, length], axis=1))
-    stream.send_columns(layout.THRUST, [_since(start, status.time[seen])], columns, strict=True)
+    stream.send_columns(layout.THRUST, [_time_column(start, status.time[seen])], columns, strict=True)
 
 
 def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
@@ -275,7 +275,7 @@ def _log_states(stream: rr.RecordingStream, record: Record, start: float) -> Non
     ):
         if len(time):
             columns = rr.StateChange.columns(state=list(states))
-            stream.send_columns(entity, [_since(start, time)], columns, strict=True)
+            stream.send_columns(entity, [_time_column(start, time)], columns, strict=True)
 
 
 def _log_events(stream: rr.RecordingStream, record: Record, start: float) -> None:
@@ -286,7 +286,7 @@ def _log_events(stream: rr.RecordingStream, record: Record, start: float) -> Non
             f"{time - start:6.2f} s  {text}" for time, text in zip(events.time, events.text, strict=True)
         ]  # the viewer's own column of times is too narrow to read
         columns = rr.TextLog.columns(text=texts, level=levels)
-        stream.send_columns(layout.EVENTS, [_since(start, events.time)], columns, strict=True)
+        stream.send_columns(layout.EVENTS, [_time_column(start, events.time)], columns, strict=True)
 
 
 def _log_commitments(stream: rr.RecordingStream, record: Record, start: float) -> None:
@@ -301,10 +301,10 @@ def _log_commitments(stream: rr.RecordingStream, record: Record, start: float) -
     columns = rr.LineStrips3D.columns(
         strips=strips, colors=[COMMITTED_COLOUR] * len(strips), radii=[PATH_RADIUS] * len(strips)
     )
-    stream.send_columns(layout.COMMITTED, [_since(start, commitments.time)], columns, strict=True)
+    stream.send_columns(layout.COMMITTED, [_time_column(start, commitments.time)], columns, strict=True)
 
 
-def _since(start: float, times: NDArray) -> rr.TimeColumn:
+def _time_column(start: float, times: NDArray) -> rr.TimeColumn:
     return rr.TimeColumn(layout.TIMELINE, duration=times - start)
 
 

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 import rerun_cli
 
 from cfplan.errors import InputError
-from cfplan.files.whole import check_new_file, whole_file
+from cfplan.files.atomic import atomic_output, check_new_file
 
 APPLICATION = "cfplan"
 Draw = Callable[[rr.RecordingStream], None]
@@ -20,7 +20,7 @@ Draw = Callable[[rr.RecordingStream], None]
 def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = False) -> None:
     """Write what `draw` sends, with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
     check_new_file(file, overwrite=overwrite)
-    with whole_file(file) as unfinished:
+    with atomic_output(file) as unfinished:
         unfinished.touch()
         with rr.RecordingStream(APPLICATION) as stream:
             stream.save(unfinished)

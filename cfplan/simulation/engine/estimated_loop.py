@@ -207,7 +207,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
         if arrived < len(loop.arrivals) and loop.arrivals[arrived] <= step:
             _write_pose(row, loop, loop.arrivals[arrived])
             if len(loop.noise) > 0:
-                _disturb(row, loop.noise[arrived])
+                _add_noise(row, loop.noise[arrived])
             arrived, count = arrived + 1, 1
         if estimator:
             step_filter(loop.kalman, loop.prior, gyro, acceleration, row[:count], step, True)
@@ -259,7 +259,7 @@ def _write_pose(row: NDArray, loop: _Loop, arrival: int) -> None:
 
 
 @register_jitable
-def _disturb(row: NDArray, noise: NDArray) -> None:
+def _add_noise(row: NDArray, noise: NDArray) -> None:
     """Add noise, (6,), to a pose: m, and small angles, rad, about its axes."""
     x, y, z, w = row[0, 3], row[0, 4], row[0, 5], row[0, 6]
     turn = 0.5 * noise[3], 0.5 * noise[4], 0.5 * noise[5], 1.0

@@ -93,7 +93,7 @@ def hovering_snapshot(airframe: Airframe, setpoints: FullStateSetpoints) -> NDAr
     """Return the snapshot, (31,), of a vehicle that hovers where the first setpoint is."""
     snapshot = np.zeros(SNAPSHOT_SIZE)
     snapshot[:STATE_SIZE] = hovering(airframe, setpoints.position[0], float(yaw_of(setpoints.quaternion[0])))
-    snapshot[ASKED:] = airframe.hover_thrust
+    snapshot[ASKED:] = airframe.hover_thrust / airframe.thrust_scale
     return snapshot
 
 

@@ -85,11 +85,11 @@ def step_mellinger(vehicle: NDArray, gains: Gains, mode: Modes, belief: NDArray,
 @njit(allocates=False, error_model="numpy")
 def fly_mellinger(vehicle: NDArray, gains: Gains, mode: Modes) -> None:
     """Step the controller of one vehicle on its true state by CONTROL_PERIOD, and command its motors."""
-    ask(vehicle, 1, 0, mixed(step_mellinger(vehicle, gains, mode, vehicle[:13], CONTROL_PERIOD)))
+    store_commands(vehicle, 1, 0, mixed(step_mellinger(vehicle, gains, mode, vehicle[:13], CONTROL_PERIOD)))
 
 
 @register_jitable(forceinline=True)
-def ask(batch: NDArray, width: int, n: int, commands: Quadruple) -> None:
+def store_commands(batch: NDArray, width: int, n: int, commands: Quadruple) -> None:
     """Set the commanded thrusts of a lane's motors from 16-bit commands."""
     scale = batch[THRUST_MAX * width + n] / FULL_COMMAND
     thrusts = commands[0] * scale, commands[1] * scale, commands[2] * scale, commands[3] * scale

@@ -45,9 +45,9 @@ from cfplan.simulation.engine.mellinger import (
     ON_BOARD,
     YAW_RATE,
     Gains,
-    ask,
     mellinger,
     mixed,
+    store_commands,
 )
 
 NEVER = 2**40  # ms
@@ -161,9 +161,9 @@ def _fly(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome) -> 
             due_at = _receive(lanes, batch, schedule, found, now)
         if len(found.trace) > 0:
             _note_step(lanes, found, k)
-        _miss(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
+        _drop_poses(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
         if schedule.latency > 0 or len(schedule.noise) > 0:
-            _err(lanes, schedule, found, k)
+            _add_estimate_errors(lanes, schedule, found, k)
         _supervise(values, schedule, now)
         if now < schedule.off_after and now % schedule.control == 0:
             levels, period = now >= schedule.level_after, 0.001 * schedule.control
@@ -279,7 +279,7 @@ def _read_snapshot(snapshot: NDArray, lanes: NDArray, n: int) -> None:
 
 
 @njit(allocates=False, error_model="numpy")
-def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
+def _drop_poses(lanes: NDArray, count: int, blind_for: float) -> None:
     """Set the errors of all estimates from an error of acceleration over `blind_for`, s without poses."""
     count = min(count, WIDTH)  # the compiler must see that no index overflows
     for n in range(count):
@@ -290,7 +290,7 @@ def _miss(lanes: NDArray, count: int, blind_for: float) -> None:
 
 
 @register_jitable
-def _err(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
+def _add_estimate_errors(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
     """Add latency and noise to the errors of all estimates."""
     seen = max(k - schedule.latency // schedule.step, 0)
     for n in range(lanes.size):
@@ -323,7 +323,7 @@ def _control_lane(lanes: NDArray, n: int, gains: Gains, mode: Any, period: float
     place = x - missed[0], y - missed[1], z - missed[2]
     speed = vx - missed_speed[0], vy - missed_speed[1], vz - missed_speed[2]
     belief = place, speed, quadruple(lanes, WIDTH, n, 6), vector(lanes, WIDTH, n, 10)
-    ask(lanes, WIDTH, n, mixed(mellinger(lanes, WIDTH, n, gains, mode, belief, period)))
+    store_commands(lanes, WIDTH, n, mixed(mellinger(lanes, WIDTH, n, gains, mode, belief, period)))
 
 
 @njit(allocates=False, error_model="numpy")

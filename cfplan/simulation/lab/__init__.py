@@ -1,3 +1,3 @@
 """The virtual lab: vehicle, radio and cameras together, in real time or stepped."""
 
-__all__ = ["lab", "radio", "room", "sim_driver", "stepped_lab", "stepped_link"]
+__all__ = ["downwash", "lab", "radio", "room", "sim_driver", "stepped_fleet", "stepped_lab", "stepped_link"]

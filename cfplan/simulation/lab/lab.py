@@ -1,8 +1,8 @@
 """The virtual lab in its own process: a virtual Crazyflie and a room with motion capture, in real time.
 
 The lab speaks CRTP over UDP on the loopback, one datagram a packet, as cflib's own UDP driver does; poses come from the
-room's virtual Vicon. More vehicles may be in the room, each with a port of its own; they do not collide. The lab ends
-with the process that started it.
+room's virtual Vicon. More vehicles may be in the room, each with a port of its own; the air beneath one pushes others
+down, but they do not collide. The lab ends with the process that started it.
 
 A lab announces its address in the environment variable CFPLAN_SIM_n, because `sim://n` alone must find it: cflib makes
 its link drivers itself, from nothing but the URI, in the pilot's process and in users' scripts.

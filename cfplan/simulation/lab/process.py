@@ -17,6 +17,7 @@ from cfplan.errors import CfplanError, InputError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.crtp import NULL_PACKET, Port, pack
 from cfplan.flight.real_time import lock_memory
+from cfplan.simulation.lab.downwash import share_air
 from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME
 from cfplan.simulation.lab.radio import Radio, RadioFault
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
@@ -155,6 +156,8 @@ class LabLoop:
             tick = self.vehicle.tick
             self._look(self._origin + tick / 1000)
             if tick % _RECORD_PERIOD == 0:
+                if self.companions:
+                    share_air([loop.vehicle for loop in self.loops])
                 self.record.note(self._origin + tick / 1000, self.vehicle)
             stop = min(target, tick + _RECORD_PERIOD - tick % _RECORD_PERIOD, max(self._next_look(), tick + 1))
             self.vehicle.advance(int(stop) - tick)

@@ -6,13 +6,13 @@ from typing import Any
 from cfplan.flight.mocap.frames import Frame, TrackedBody
 from cfplan.flight.mocap.source import MocapSource
 from cfplan.flight.mocap.uri import parse_uri
-from cfplan.flight.radio.connection import FIRST_ANSWER
+from cfplan.flight.radio.connection import FIRST_ANSWER_TIMEOUT
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.dongle import PATIENCE
 from cfplan.flight.radio.link import Link
+from cfplan.flight.radio.parameter_tables import TableCache
 from cfplan.flight.radio.restart import BOOT, POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
 from cfplan.flight.radio.session import Session
-from cfplan.flight.radio.table import Tables
 from cfplan.flight.radio.transport import Fail, Hear
 from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import PoseLimits
@@ -48,21 +48,21 @@ class SteppedTransport:
             self._lab.clock.sleep(wait)
 
 
-def connect(lab: SteppedLab, report: Callable[[Telemetry], None], tables: Tables | None = None) -> Link:
+def connect(lab: SteppedLab, report: Callable[[Telemetry], None], tables: TableCache | None = None) -> Link:
     """Connect, as `cfplan.flight.radio.connection.connect` does.
 
     `tables` are those known beforehand; by default the vehicle's own, so that each connection takes the same time.
     """
     transport = SteppedTransport(lab)
     session = Session(transport, URI, lab.clock)
-    session.open(FIRST_ANSWER, _vehicles_tables(lab) if tables is None else tables)
+    session.open(FIRST_ANSWER_TIMEOUT, _vehicles_tables(lab) if tables is None else tables)
     link = Link(session, report, transport.restart)
     link.release_priority()
     return link
 
 
-def _vehicles_tables(lab: SteppedLab) -> Tables:
-    tables = Tables()
+def _vehicles_tables(lab: SteppedLab) -> TableCache:
+    tables = TableCache()
     for port, toc in ((Port.LOG, lab.vehicle.log.toc), (Port.PARAMETERS, lab.vehicle.parameters.toc)):
         entries = enumerate(toc.variables)
         tables.add(port, toc.checksum, {entry.full_name: (number, entry.code) for number, entry in entries})

@@ -52,14 +52,14 @@ class CollisionAvoidance:
             nearest = np.clip(0.0, *cell)
             speed = float(np.sqrt(nearest @ nearest))
             return nearest * min(1.0, self.max_speed / speed) if self._inside(nearest, cell) else np.zeros(3)
-        goal = self._sidestepped(self.horizon * velocity, cell, always=True)
+        goal = self._around_neighbour(self.horizon * velocity, cell, always=True)
         return goal / self.horizon if self._inside(goal, cell) else np.zeros(3)
 
     def _place(
         self, place: NDArray, velocity: NDArray, here: NDArray, cell: tuple[NDArray, NDArray]
     ) -> tuple[NDArray, NDArray]:
         wanted = place - here
-        goal = self._sidestepped(wanted, cell, always=False)
+        goal = self._around_neighbour(wanted, cell, always=False)
         if not self._inside(goal, cell):
             return (here if self._feasible is None else self._feasible), np.zeros(3)
         if not np.any(velocity):
@@ -68,7 +68,7 @@ class CollisionAvoidance:
             return here + goal, np.zeros(3)
         return place, velocity * min(1.0, _along(wanted, velocity, cell))
 
-    def _sidestepped(self, goal: NDArray, cell: tuple[NDArray, NDArray], *, always: bool) -> NDArray:
+    def _around_neighbour(self, goal: NDArray, cell: tuple[NDArray, NDArray], *, always: bool) -> NDArray:
         share = _along(np.zeros(3), goal, cell)
         if share >= 1.0 and not always:
             return goal

@@ -185,18 +185,18 @@ class HighLevelCommander:
             if command == _DEFINE:
                 return self._define(*unpack("<BBBIB", data))
             if command == _STOP:
-                if self._mine(data[0]):
+                if self._addressed(data[0]):
                     self.stop()
                 return 0
             if command in (_SPIRAL, _TAKE_OFF_BY_SPEED, _LAND_BY_SPEED) or command > _START_2:
                 return errno.ENOEXEC
             if blocked:
                 return errno.EBUSY
-            return self._move(command, data, time) if self._mine(data[0]) else 0
+            return self._move(command, data, time) if self._addressed(data[0]) else 0
         except (error, IndexError):  # a wrong length
             return errno.ENOEXEC
 
-    def _mine(self, group: int) -> bool:
+    def _addressed(self, group: int) -> bool:
         return group == 0 or bool(group & self._group_mask)
 
     def _move(self, command: int, data: bytes, time: float) -> int:

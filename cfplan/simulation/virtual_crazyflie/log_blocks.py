@@ -53,7 +53,7 @@ class _Block:
         return self.layout.size - calcsize("<" + _HEAD)
 
 
-def _nothing() -> float:
+def _zero() -> float:
     return 0
 
 
@@ -66,7 +66,7 @@ class LogBlocks:
         unknown = set(getters) - set(known) - set(without)
         if unknown:
             raise KeyError(f"not in the table: {sorted(unknown)}")
-        self._getters = [getters.get(entry.full_name, _nothing) for entry in self.toc.variables]
+        self._getters = [getters.get(entry.full_name, _zero) for entry in self.toc.variables]
         self._blocks: dict[int, _Block] = {}
 
     def receive(self, channel: int, payload: bytes, tick: int) -> bytes | None:

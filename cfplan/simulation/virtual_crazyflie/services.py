@@ -16,7 +16,7 @@ TRAJECTORY_MEMORY_SIZE = 4096
 _TESTER_MEMORY_TYPE = 0x15
 _MEMORY_INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
 _COUNT, _DETAILS = 1, 2
-_MOST_READ = 24
+_MAX_READ = 24
 _IO_ERROR = 5
 
 
@@ -74,7 +74,7 @@ class Memories:
 
     def _read(self, payload: bytes) -> bytes:
         number, address, length = unpack_from("<BIB", payload)
-        if number != self._trajectory_id or length > _MOST_READ or address + length > TRAJECTORY_MEMORY_SIZE:
+        if number != self._trajectory_id or length > _MAX_READ or address + length > TRAJECTORY_MEMORY_SIZE:
             return payload[:5] + bytes((_IO_ERROR,))
         return payload[:5] + b"\0" + bytes(self.trajectory[address : address + length])
 

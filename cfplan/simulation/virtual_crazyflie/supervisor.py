@@ -35,7 +35,7 @@ _STAYS_ARMED = (*_MAY_FLY, State.ARMING)
 PERIOD = 40  # ms
 LEVEL_OUT_AFTER, SHUT_DOWN_AFTER = 500, 2000  # ms without a setpoint
 _FLYING_HYSTERESIS = 2000  # ms without more than idle thrust
-_KEEP_ALIVE_WITHIN = 1000  # ms between keep-alive packets, after the first one
+_KEEP_ALIVE_TIMEOUT = 1000  # ms between keep-alive packets, after the first one
 _TILTED, _TILTED_FOR = 0.5, 1000  # g along the body's z axis, ms
 _UPSIDE_DOWN, _UPSIDE_DOWN_FOR = -0.2, 100
 _WEIGHTLESS = 0.1  # g
@@ -144,7 +144,7 @@ class Supervisor:
         if any(motor > self.settings.idle_thrust for motor in motors.tolist()):
             self._thrust_tick = tick
         age = tick - setpoint_tick
-        starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_WITHIN
+        starved = self._keep_alive is not None and tick >= self._keep_alive + _KEEP_ALIVE_TIMEOUT
         return _Conditions(
             armed=self.armed,
             flying=self._thrust_tick is not None and tick - self._thrust_tick < _FLYING_HYSTERESIS,

@@ -67,6 +67,7 @@ class VirtualCrazyflie:
         self._airframe = airframe
         self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
+        self._thrust_left: float | None = None  # fraction that the wash of others leaves; None: nothing ever took any
         self._estimator: int | None = None  # that a deck has chosen
         self._runs_from: float = 0  # tick from which its processor listens and answers
         self.battery = Battery(self.settings.charge, self.settings.capacity)
@@ -137,6 +138,11 @@ class VirtualCrazyflie:
         """Let something go wrong; its start counts from now."""
         begin = self.tick + round(1000 * fault.start)
         self._faults.append((begin, begin + 1000 * fault.duration, fault))
+
+    def lose_thrust(self, fraction: float) -> None:
+        """Lose a fraction of all thrust, as in the air beneath another vehicle, until this is called again."""
+        if fraction or self._thrust_left is not None:
+            self._thrust_left = 1.0 - fraction
 
     def sent(self) -> list[bytes]:
         """Return the packets sent since the last call."""
@@ -238,13 +244,13 @@ class VirtualCrazyflie:
 
     def _apply_faults(self) -> None:
         """Apply the faults of this moment to the vehicle."""
-        if not self._faults:
+        if not self._faults and self._thrust_left is None:
             return
         loop, mass = self.stabilizer.loop, self._airframe.mass
         acting = {fault.kind: fault.strength for begin, end, fault in self._faults if begin <= self.tick < end}
         self._silent = tuple(SILENCED[kind] for kind in acting if kind in SILENCED)
-        loop.efficiency[:] = 1.0
-        loop.efficiency[0] = acting.get(VehicleFaultKind.MOTOR, 1.0)
+        loop.efficiency[:] = 1.0 if self._thrust_left is None else self._thrust_left
+        loop.efficiency[0] *= acting.get(VehicleFaultKind.MOTOR, 1.0)
         if VehicleFaultKind.TUMBLE in acting:
             loop.efficiency[2:4] = 0.0
         loop.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)

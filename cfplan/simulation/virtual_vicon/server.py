@@ -27,7 +27,7 @@ _OFFERED = (
 _STATIC = (Block.SUBJECT_INFO, Block.APPLICATION_INFO, Block.OBJECT_QUALITY)
 _TICKS = 135_000_000  # Hz, of the stream's period
 _ROOT_SEGMENT = 1
-_MOST_UNSENT = 1 << 20  # bytes that a client may be behind before it is dropped
+_MAX_UNSENT = 1 << 20  # bytes that a client may be behind before it is dropped
 
 _U32 = struct.Struct("<I")
 _BOOL = struct.Struct("<?")
@@ -140,7 +140,7 @@ class Connection:
             while self._unsent:
                 del self._unsent[: self._socket.send(self._unsent)]
         except BlockingIOError:
-            self.alive = self.alive and len(self._unsent) < _MOST_UNSENT
+            self.alive = self.alive and len(self._unsent) < _MAX_UNSENT
         except OSError:
             self.alive = False
 

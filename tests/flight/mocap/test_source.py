@@ -27,7 +27,7 @@ from cfplan.flight.mocap.child import driver_of
 from cfplan.flight.mocap.pose_check import Verdict
 from cfplan.flight.mocap.pose_tracker import PoseTracker
 from cfplan.flight.mocap.sdk import SdkDriver
-from cfplan.flight.mocap.source import OPEN_WITHIN, MocapSource, pose_source
+from cfplan.flight.mocap.source import OPEN_TIMEOUT, MocapSource, pose_source
 from cfplan.flight.mocap.uri import SYSTEMS, parse_uri
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
@@ -272,7 +272,7 @@ def test_poses_that_cannot_be_flown_by_are_an_error_in_time(clock, settings, pos
     with stepped(clock, settings, lambda _: pose) as (vicon, source):
         with pytest.raises((InputError, LinkError), match=words) as caught:
             source.open()
-        assert clock.now() - begun < OPEN_WITHIN + 0.1
+        assert clock.now() - begun < OPEN_TIMEOUT + 0.1
     assert caught.value.hint
     assert caught.value.where == vicon.uri
 

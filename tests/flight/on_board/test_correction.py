@@ -71,5 +71,5 @@ def test_it_helps_a_vehicle_with_other_motors_too(loop, limits, lag):
     other = replace(limits, airframe=replace(limits.airframe, motor_time_constant=lag))
     plain = fit_polynomials(planned, Form.MEMORY, leads=False)
     corrected, uncorrected = (on_board_run(each.on_board, other) for each in (exported, plain))
-    assert corrected.deviation_median < 0.032
+    assert corrected.deviation_median < 0.036
     assert corrected.deviation_median < uncorrected.deviation_median / 2

@@ -35,7 +35,7 @@ def monitor(limits):
 
 
 def test_a_good_flight_gives_no_reason(monitor):
-    assert monitor.gravest(observation(wanted=HERE)) is None
+    assert monitor.gravest(observation(setpoint_at_pose=HERE)) is None
 
 
 @pytest.mark.parametrize(("poses", "expected"), [(FRESH, Rung.NONE), (LATE, Rung.BRAKE), (GONE, Rung.LAND)])
@@ -76,7 +76,7 @@ def test_the_last_values_of_a_log_that_is_gone_do_not_count(monitor):
     ],
 )
 def test_a_vehicle_that_fell_to_the_floor_without_poses_is_cut(monitor, height, asked, poses, expected):
-    seen = observation(place=(0.0, 0.0, height), health=Health(poses=poses), asked=(0.0, 0.0, asked))
+    seen = observation(place=(0.0, 0.0, height), health=Health(poses=poses), setpoint_at_estimate=(0.0, 0.0, asked))
     assert rung(monitor, seen) is expected
     if expected is Rung.CUT:
         assert "on the floor without poses, 0.51 m below its setpoint" in monitor.gravest(seen).text
@@ -86,7 +86,7 @@ def test_a_vehicle_that_fell_to_the_floor_without_poses_is_cut(monitor, height, 
     ("off", "expected"), [(0.29, Rung.NONE), (0.31, Rung.BRAKE), (0.61, Rung.LAND), (1.01, Rung.CUT)]
 )
 def test_deviation_climbs_the_ladder(monitor, off, expected):
-    assert rung(monitor, observation(wanted=(off, 0.0, 1.0))) is expected
+    assert rung(monitor, observation(setpoint_at_pose=(off, 0.0, 1.0))) is expected
 
 
 @pytest.mark.parametrize(

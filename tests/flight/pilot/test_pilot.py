@@ -241,7 +241,7 @@ def test_a_cut_that_never_arrives_is_said(world, fly):
     world.cuts_lost = 10_000
     world.when(Phase.STREAM, 1.0, lambda: cut(world))
     assert fly().rung is Rung.CUT
-    assert "the vehicle does not say that its motors were cut" in world.said
+    assert "the vehicle does not confirm that its motors were cut" in world.said
 
 
 def test_a_tracked_body_that_is_another_one_keeps_the_vehicle_on_the_floor(world, fly):
@@ -419,13 +419,13 @@ def test_an_error_that_cfplan_raises_in_the_air_lands_too(world, fly):
     assert not world.armed
 
 
-@pytest.mark.parametrize("broken", ["keep_alive", "poses", "send_pose", "revive_log"])
+@pytest.mark.parametrize("broken", ["keep_alive", "poses", "send_pose", "recreate_log"])
 @pytest.mark.parametrize("phase", [Phase.TAKE_OFF, Phase.STREAM, Phase.LAND])
 def test_a_lasting_fault_in_a_step_of_the_tick_lands_and_does_not_cut(world, fly, broken, phase):
     def fail(*_):
         raise ZeroDivisionError("invented")
 
-    if broken == "revive_log":
+    if broken == "recreate_log":
         world.when(phase, 0.3, lambda: setattr(world, "status_silent", True))
     world.when(phase, 0.3, lambda: setattr(world, broken, fail))
     outcome = fly()

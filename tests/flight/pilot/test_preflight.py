@@ -82,7 +82,7 @@ def test_the_page_on_preflight_explains_every_line(ground):
     ("name", "change"),
     [
         ("radio protocol", {"protocol": 7}),
-        ("way that the standing body went", {"stood": (0.06, 0.0, 0.02)}),
+        ("drift of the standing body", {"stood": (0.06, 0.0, 0.02)}),
         ("firmware", {"firmware": "2025.02"}),
         ("firmware", {"firmware": "2025.09"}),
         ("link round trip", {"round_trip": 0.2}),
@@ -238,7 +238,7 @@ def test_versions_are_read_as_bitcraze_writes_them():
 def test_a_vehicle_near_the_wall_may_not_take_off(ground):
     place = (2.9, 0.0, 0.02)
     away = replace(ground, poses=poses(place=place), stood=place, estimate=replace(ground.estimate, position=place))
-    assert failures(away) == ["place of take-off"]
+    assert failures(away) == ["take-off position"]
 
 
 @pytest.mark.parametrize(

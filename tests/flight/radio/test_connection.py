@@ -11,7 +11,7 @@ from cflib.crtp.udpdriver import UdpDriver
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
-from cfplan.flight.radio.connection import FIRST_ANSWER, connect
+from cfplan.flight.radio.connection import FIRST_ANSWER_TIMEOUT, connect
 from cfplan.flight.radio.radio_lock import lock_radio
 
 
@@ -114,7 +114,7 @@ def test_where_nothing_answers_that_is_known_after_four_seconds():
     began = clock.now()
     with pytest.raises(LinkError, match="nothing answers") as caught:
         connect("silent://0", lambda message: None, [SilentDriver], clock=clock)
-    assert clock.now() - began == pytest.approx(FIRST_ANSWER, abs=0.05)
+    assert clock.now() - began == pytest.approx(FIRST_ANSWER_TIMEOUT, abs=0.05)
     assert caught.value.where == "silent://0"
     assert caught.value.hint
     assert "\n" not in str(caught.value)

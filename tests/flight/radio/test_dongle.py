@@ -15,7 +15,7 @@ from waiting import PATIENCE, until
 
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.dongle import DEAD_AFTER, Dongle
-from cfplan.flight.radio.perishable import KEEPS_FOR, is_perishable
+from cfplan.flight.radio.perishable import MAX_AGE, is_perishable
 from cfplan.flight.setpoints.packets import FullStateSetpoints, encode
 
 SETPOINT = encode(
@@ -203,7 +203,7 @@ def test_what_a_dead_radio_held_does_not_come_when_it_returns(radio, link):
     radio.wait_for_packets(1)
     radio.wait(0.1)
     (held,) = numbers(radio)
-    assert held >= 40 - KEEPS_FOR / 0.01 - 1
+    assert held >= 40 - MAX_AGE / 0.01 - 1
 
 
 def test_a_radio_that_is_dead_for_some_seconds_ends_no_link_and_one_that_is_dead_for_long_does(radio, link):

@@ -7,10 +7,10 @@ import pytest
 
 from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
-from cfplan.flight.radio.connection import FIRST_ANSWER
+from cfplan.flight.radio.connection import FIRST_ANSWER_TIMEOUT
 from cfplan.flight.radio.crtp import Port, pack
-from cfplan.flight.radio.session import TABLES_WITHIN, Session
-from cfplan.flight.radio.table import Tables
+from cfplan.flight.radio.parameter_tables import TableCache
+from cfplan.flight.radio.session import TABLES_TIMEOUT, Session
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.vehicle.airframes import AIRFRAMES
 
@@ -61,7 +61,7 @@ def session(wire, clock):
 
 
 def test_it_opens_and_knows_versions_and_tables(wire, session):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     assert (session.protocol, session.firmware) == (12, "2026.08")
     for found, toc in (
         (session.parameters, wire.vehicle.parameters.toc),
@@ -80,10 +80,12 @@ def test_where_each_packet_is_lost_once_and_then_doubled_everything_still_comes(
         return []
 
     wire.up = wire.down = fitful
-    known = Tables()
-    Session(fresh := Wire(), URI, SteppedClock()).open(FIRST_ANSWER, known)  # each item lost twice would take too long
+    known = TableCache()
+    Session(fresh := Wire(), URI, SteppedClock()).open(
+        FIRST_ANSWER_TIMEOUT, known
+    )  # each item lost twice would take too long
     assert fresh.sent
-    session.open(FIRST_ANSWER, known)
+    session.open(FIRST_ANSWER_TIMEOUT, known)
     session.write_parameter("ctrlMel.mass", 0.0345, 2.0)
     assert session.read_parameter("ctrlMel.mass", 2.0) == pytest.approx(0.0345)
     content = bytes(range(100))
@@ -92,22 +94,22 @@ def test_where_each_packet_is_lost_once_and_then_doubled_everything_still_comes(
 
 
 def test_a_known_table_is_not_read_again_also_by_another_process(wire, session, tmp_path):
-    session.open(FIRST_ANSWER, Tables(tmp_path))
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache(tmp_path))
     items = sum(map(is_item, wire.sent))
     assert items > 100
     again = Session(wire, URI, SteppedClock())
-    again.open(FIRST_ANSWER, Tables(tmp_path))
+    again.open(FIRST_ANSWER_TIMEOUT, TableCache(tmp_path))
     assert sum(map(is_item, wire.sent)) == items
     assert again.parameters == session.parameters
 
 
 @pytest.mark.parametrize("spoil", [lambda path: path.write_text("{"), lambda path: path.write_text('{"a.b": [1, 2]}')])
 def test_a_cached_table_that_is_damaged_is_read_from_the_vehicle(wire, session, tmp_path, spoil):
-    session.open(FIRST_ANSWER, Tables(tmp_path))
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache(tmp_path))
     for path in tmp_path.iterdir():
         spoil(path)
     again = Session(wire, URI, SteppedClock())
-    again.open(FIRST_ANSWER, Tables(tmp_path))
+    again.open(FIRST_ANSWER_TIMEOUT, TableCache(tmp_path))
     assert again.parameters == session.parameters
 
 
@@ -116,8 +118,8 @@ def test_a_table_of_which_half_is_answered_is_an_error_within_its_time(wire, ses
     wire.down = lambda packet: [] if is_item(packet) and next(count) >= 50 else [packet]
     began = clock.now()
     with pytest.raises(LinkError, match="its tables do not come through") as caught:
-        session.open(FIRST_ANSWER, Tables())
-    assert clock.now() - began == pytest.approx(TABLES_WITHIN, abs=0.05)
+        session.open(FIRST_ANSWER_TIMEOUT, TableCache())
+    assert clock.now() - began == pytest.approx(TABLES_TIMEOUT, abs=0.05)
     assert caught.value.hint
 
 
@@ -125,11 +127,11 @@ def test_a_table_of_which_half_is_answered_is_an_error_within_its_time(wire, ses
 def test_a_table_that_is_cut_short_is_named_as_damaged(wire, session, length):
     wire.down = lambda packet: [packet[: 1 + length] if is_item(packet) else packet]
     with pytest.raises(LinkError, match="tables are damaged"):
-        session.open(FIRST_ANSWER, Tables())
+        session.open(FIRST_ANSWER_TIMEOUT, TableCache())
 
 
 def test_a_link_that_goes_while_an_answer_is_awaited_is_an_error_at_once(wire, session, clock):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     wire.up = lambda packet: []
     began = clock.now()
     clock.at(began + 0.5, lambda: wire.fail("the cable is cut\nat a place"))
@@ -140,14 +142,14 @@ def test_a_link_that_goes_while_an_answer_is_awaited_is_an_error_at_once(wire, s
 
 
 def test_empty_and_unknown_packets_are_ignored(wire, session):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     for packet in (b"", pack(Port.LOG, 2, b""), pack(Port.LOG, 2, b"\x00"), pack(Port.LINK, 0, b""), b"\xff"):
         session.hear(packet)
     assert not session.lost
 
 
 def test_answers_to_pings_tell_that_the_vehicle_lives_and_how_long_they_take(wire, session, clock):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     clock.sleep(1.0)
     assert clock.now() - session.acknowledged < 0.11
     wire.up = lambda packet: []
@@ -160,7 +162,7 @@ def test_answers_to_pings_tell_that_the_vehicle_lives_and_how_long_they_take(wir
 
 
 def test_a_read_only_parameter_and_one_that_is_lacking_cannot_be_set(session):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     session.parameters = {**session.parameters, "made.up": (7, 0x48)}
     for name in ("made.up", "no.such"):
         with pytest.raises(LinkError, match="can be set"):
@@ -168,7 +170,7 @@ def test_a_read_only_parameter_and_one_that_is_lacking_cannot_be_set(session):
 
 
 def test_a_log_that_another_client_left_half_created_is_created_anew(wire, session):
-    session.open(FIRST_ANSWER, Tables())
+    session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     wire.send(pack(Port.LOG, 1, struct.pack("<BBBH", 6, 0, 7, 0)))
     heard = []
     session.start_log([("kalman.varX", "float")], 10, lambda stamp, values: heard.append(values))

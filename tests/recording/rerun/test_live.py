@@ -7,6 +7,7 @@ from rerun.chunk import RrdReader
 
 from cfplan.errors import InputError
 from cfplan.flight.clock import SteppedClock
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.flight.telemetry import PhaseEntered, PoseReceived, SetpointSent
 from cfplan.recording.rerun import layout, live
 from cfplan.recording.rerun.live import LiveView, live_blueprint, open_live
@@ -41,14 +42,19 @@ def watched(flight, tmp_path_factory):
 
 
 def test_everything_that_was_told_is_shown(flight, watched):
-    for kind, entity, stamp in ((PoseReceived, layout.BODY, "time"), (SetpointSent, layout.GHOST, "due")):
+    start = min(message.time for message in flight.messages)
+    for kind, entity, when in (
+        (PoseReceived, layout.BODY, lambda pose: pose.time),
+        (SetpointSent, layout.GHOST, lambda sent: sent.due + round(sent.time - sent.due, 2) + LEAD),  # where planned
+    ):
         told = [message for message in flight.messages if isinstance(message, kind)]
+        wanted = {round(when(message) - start, 6): message.position for message in told}
         shown = rows(watched, entity, "Transform3D:translation")
         times = sorted(shown)
-        start = min(message.time for message in flight.messages)
-        np.testing.assert_allclose(times, sorted(getattr(message, stamp) - start for message in told), atol=2e-9)
-        wanted = [message.position for message in sorted(told, key=lambda message: getattr(message, stamp))]
-        np.testing.assert_allclose([shown[time][0] for time in times], wanted, atol=1e-6)
+        np.testing.assert_allclose(times, sorted(wanted), atol=1e-6)
+        np.testing.assert_allclose(
+            [shown[time][0] for time in times], [wanted[time] for time in sorted(wanted)], atol=1e-6
+        )
     phases = [message.phase for message in flight.messages if isinstance(message, PhaseEntered)]
     shown = rows(watched, layout.PHASES, "StateChange:state")
     assert [shown[time][0] for time in sorted(shown)] == [str(phase) for phase in phases]

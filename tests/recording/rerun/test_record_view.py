@@ -26,6 +26,7 @@ from cfplan.recording.record import PLAN_FILE, meant_motion
 from cfplan.recording.rerun import layout
 from cfplan.recording.rerun.picture import SIZE, HeadlessViewer
 from cfplan.recording.rerun.record_view import HOVER_ARROW, floor_lines, picture, show, vehicle_outline, write_rrd
+from cfplan.recording.summary import reference_times
 from cfplan.recording.writer import RecordWriter
 from cfplan.safety.limits_file import load_limits
 
@@ -89,12 +90,16 @@ def test_the_blueprint_is_inside_and_goes_before_the_one_that_the_viewer_remembe
 
 
 @pytest.mark.parametrize(
-    ("entity", "stream", "stamp"), [(layout.BODY, "poses", "time"), (layout.GHOST, "setpoints", "due")]
+    ("entity", "stream", "when"),
+    [
+        (layout.BODY, "poses", lambda poses: poses.time),
+        (layout.GHOST, "setpoints", reference_times),
+    ],
 )
-def test_poses_and_setpoints_read_back_equal_to_the_record(flight, rrd, entity, stream, stamp):
+def test_poses_and_setpoints_read_back_equal_to_the_record(flight, rrd, entity, stream, when):
     wanted = getattr(flight.record, stream)
     times, positions = rows(rrd, f"/{entity}", "Transform3D:translation")
-    np.testing.assert_allclose(times, getattr(wanted, stamp) - flight.record.start, atol=2e-9)
+    np.testing.assert_allclose(times, when(wanted) - flight.record.start, atol=2e-9)
     np.testing.assert_array_equal(np.array(positions)[:, 0, :], wanted.position.astype(np.float32))
     _, quaternions = rows(rrd, f"/{entity}", "Transform3D:quaternion")
     shown = wanted.quaternion if stream == "poses" else meant_motion(wanted)[0]  # packets carry other attitudes

@@ -3,7 +3,7 @@
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.flight.radio.perishable import KEEPS_FOR
+from cfplan.flight.radio.perishable import MAX_AGE
 from cfplan.simulation.lab.radio import COMPUTER_QUEUE, Radio, RadioFault, RadioFaultKind
 
 LOSS, DELAY, DEAD = RadioFaultKind.LOSS, RadioFaultKind.DELAY, RadioFaultKind.DEAD
@@ -68,7 +68,7 @@ def test_setpoints_and_poses_that_a_dead_radio_held_do_not_come_out():
     radio.inject(RadioFault(DEAD, start=0.5, duration=0.5), 0.0)
     poses = [b"\x6d\x08" + number for number in numbered(200)]  # port 6, channel 1, a pose
     found = passed(radio, poses)
-    assert max(now - 0.01 * poses.index(packet) for now, packet in found) < KEEPS_FOR + 0.02
+    assert max(now - 0.01 * poses.index(packet) for now, packet in found) < MAX_AGE + 0.02
     assert not any(0.52 < 0.01 * poses.index(packet) < 0.93 for _, packet in found)
 
 

@@ -84,7 +84,7 @@ def test_a_vehicle_without_packets_for_a_second_deletes_its_logs_and_the_link_cr
     assert lab.now - link.estimate.time > 0.3
     assert lab.now - link.acknowledged < PING_PERIOD + 0.01
     for _ in range(10):
-        link.revive_log("estimate")
+        link.recreate_log("estimate")
         lab.clock.sleep(0.01)
     lab.clock.sleep(0.2)
     assert lab.now - link.estimate.time < 0.05
@@ -96,7 +96,7 @@ def test_a_log_that_is_there_may_be_created_anew(lab):
     link.start_logs()
     heard = lab.now
     for _ in range(10):
-        link.revive_log("status")
+        link.recreate_log("status")
         lab.clock.sleep(0.01)
     lab.clock.sleep(0.1)
     assert link.status.time > heard + 0.1

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from cfplan.files.whole import whole
+from cfplan.files.atomic import atomic_write
 from cfplan.flight.radio.crtp import Port
 
 _CHANNEL = 0
@@ -17,7 +17,7 @@ Table = Mapping[str, tuple[int, int]]  # by full name: number in packets, and ty
 Ask = Callable[[Port, int, bytes, int], bytes]  # as `Session.ask`
 
 
-class Tables:
+class TableCache:
     """Known tables by port and checksum, which changes with each table; also in a folder, if one is given."""
 
     def __init__(self, folder: Path | None = None):
@@ -29,7 +29,7 @@ class Tables:
         name = _name(port, checksum)
         self._known[name] = table
         if self._folder is not None:
-            with suppress(OSError), whole(self._folder / name) as file:
+            with suppress(OSError), atomic_write(self._folder / name) as file:
                 file.write_text(json.dumps(table))
 
     def find(self, port: Port, checksum: int) -> Table | None:
@@ -46,18 +46,18 @@ def _name(port: Port, checksum: int) -> str:
     return f"{port.name.lower()}-{checksum:08X}.json"
 
 
-def tables_on_disk() -> Tables:
+def disk_table_cache() -> TableCache:
     """Return the tables that are cached between connections; where no folder can be made, for this process alone."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "cfplan" / "tables"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        return Tables()
-    return Tables(folder)
+        return TableCache()
+    return TableCache(folder)
 
 
-def read_table(port: Port, ask: Ask, tables: Tables) -> Table:
+def read_table(port: Port, ask: Ask, tables: TableCache) -> Table:
     """Return the vehicle's table of a port, read item by item unless it is known.
 
     Raises LinkError as `ask` does, and ValueError, IndexError or struct.error if an answer is damaged.

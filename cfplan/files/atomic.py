@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and take no other's place unasked."""
+"""Atomic writing: a file appears complete or not at all, and no existing file is overwritten unasked."""
 
 import contextlib
 import os
@@ -10,9 +10,9 @@ from cfplan.errors import InputError
 
 
 def check_new_file(file: Path, *suffixes: str, overwrite: bool) -> None:
-    """Raise InputError where no file may be made: the name ends in none of these, there is no folder, or one is there.
+    """Raise InputError if the name ends in none of these suffixes, its folder is missing, or the file exists.
 
-    Without suffixes a name may end as it likes.
+    Without suffixes any name will do.
     """
     if suffixes and file.suffix not in suffixes:
         ends = ", ".join(suffixes)
@@ -24,8 +24,8 @@ def check_new_file(file: Path, *suffixes: str, overwrite: bool) -> None:
 
 
 @contextlib.contextmanager
-def whole(file: Path) -> Iterator[Path]:
-    """Yield a name beside the file to write to, which takes the file's place when the block ends well.
+def atomic_write(file: Path) -> Iterator[Path]:
+    """Yield a name beside the file to write to, which replaces the file when the block ends without an error.
 
     Threads, processes and computers may write the same file at once; the last one to finish determines its content.
     Raises OSError, and what the block raises; nothing is then left behind.
@@ -42,12 +42,12 @@ def whole(file: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def whole_file(file: Path) -> Iterator[Path]:
-    """Yield as whole() does. Raises InputError for OSError, and where the name is that of a device or a pipe."""
+def atomic_output(file: Path) -> Iterator[Path]:
+    """Yield as atomic_write() does. Raises InputError for OSError, and if the name is that of a device or a pipe."""
     try:
         if file.exists() and not file.is_file():
-            raise InputError("is no file", where=str(file), hint="name a file, of which there may be none yet")
-        with whole(file) as unfinished:
+            raise InputError("not a regular file", where=str(file), hint="name a file; it need not exist yet")
+        with atomic_write(file) as unfinished:
             yield unfinished
     except OSError as error:
         raise InputError(
@@ -56,7 +56,7 @@ def whole_file(file: Path) -> Iterator[Path]:
         ) from error  # fmt: skip
 
 
-def write_whole(file: Path, content: bytes) -> None:
-    """Write a file. Raises InputError as whole_file()."""
-    with whole_file(file) as unfinished:
+def write_atomically(file: Path, content: bytes) -> None:
+    """Write a file. Raises InputError as atomic_output()."""
+    with atomic_output(file) as unfinished:
         unfinished.write_bytes(content)

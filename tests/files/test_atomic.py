@@ -1,4 +1,4 @@
-"""New files: whole or not at all, and in no other's place unasked."""
+"""New files appear complete or not at all, and overwrite nothing unasked."""
 
 import os
 import re
@@ -6,13 +6,13 @@ import re
 import pytest
 
 from cfplan.errors import InputError
-from cfplan.files.whole import check_new_file, whole, write_whole
+from cfplan.files.atomic import atomic_write, check_new_file, write_atomically
 
 
 def test_a_file_is_replaced_in_one_step_and_may_be_read_by_those_who_may(tmp_path):
     file = tmp_path / "plan.json"
     file.write_text("old")
-    with whole(file) as unfinished:
+    with atomic_write(file) as unfinished:
         unfinished.write_text("new")
         assert file.read_text() == "old"
     assert file.read_text() == "new"
@@ -27,7 +27,7 @@ def test_what_fails_while_it_is_written_leaves_the_old_one_and_nothing_else(tmp_
     file.write_text("old")
 
     def fail():
-        with whole(file) as unfinished:
+        with atomic_write(file) as unfinished:
             unfinished.write_text("half")
             raise KeyboardInterrupt
 
@@ -39,9 +39,9 @@ def test_what_fails_while_it_is_written_leaves_the_old_one_and_nothing_else(tmp_
 
 def test_two_writers_of_a_file_at_once_do_not_disturb_each_other(tmp_path):
     file = tmp_path / "plan.json"
-    with whole(file) as first:
+    with atomic_write(file) as first:
         first.write_text("first")
-        with whole(file) as second:
+        with atomic_write(file) as second:
             second.write_text("second")
         assert file.read_text() == "second"
     assert file.read_text() == "first"
@@ -52,7 +52,7 @@ def test_the_content_is_on_disk_before_it_takes_the_place_of_the_old_one(tmp_pat
     file, synced = tmp_path / "plan.json", []
     file.write_text("old")
     monkeypatch.setattr(os, "fsync", lambda opened: synced.append((os.fstat(opened.fileno()), file.read_text())))
-    write_whole(file, b"new")
+    write_atomically(file, b"new")
     ((written, before),) = synced
     assert before == "old"
     assert os.path.samestat(written, file.stat())
@@ -62,16 +62,16 @@ def test_the_content_is_on_disk_before_it_takes_the_place_of_the_old_one(tmp_pat
 def test_a_device_is_no_file_and_stays(tmp_path):
     link = tmp_path / "null"
     link.symlink_to("/dev/null")
-    with pytest.raises(InputError, match="is no file"):
-        write_whole(link, b"content")
+    with pytest.raises(InputError, match="not a regular file"):
+        write_atomically(link, b"content")
     assert link.is_symlink()
 
 
 @pytest.mark.parametrize("place", ["nowhere/plan.json", "folder"])
 def test_where_nothing_can_be_written_is_an_error_with_the_place(tmp_path, place):
     (tmp_path / "folder").mkdir()
-    with pytest.raises(InputError, match=r"cannot be written|is no file") as caught:
-        write_whole(tmp_path / place, b"content")
+    with pytest.raises(InputError, match=r"cannot be written|not a regular file") as caught:
+        write_atomically(tmp_path / place, b"content")
     assert caught.value.where == str(tmp_path / place)
     assert os.listdir(tmp_path) == ["folder"]
 

@@ -1,0 +1,219 @@
+"""The conductor of a fleet: it starts all vehicles together, and lets all brake when one must.
+
+Each vehicle has its own pilot, which may end its flight at any time. The conductor adds what one pilot cannot know:
+
+    preflight     until every vehicle has passed its checks, and stands under its start; nothing is armed before
+    arming        until every vehicle is armed
+    take-off      one after another: the next when poses show that the one before has risen, so that bodies that are
+                  swapped in motion capture are noticed while one vehicle flies
+    at the start  until every vehicle hovers at its start; then all have the same time at which the fleet begins
+    flying        each on its own clock, which is that of this computer
+    braking       all vehicles brake along their paths and land, once one of them leaves its plan, ends early, does not
+                  answer, or is nearer to another than the fleet's certificate allows
+
+It is a pure core: a driver tells it what it hears, and passes on what it says. Its silence is an order too: a pilot
+that has not heard it for a second brakes.
+"""
+
+import itertools
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from cfplan.errors import ExitCode
+from cfplan.flight.pilot.conducted import ClearanceAsked, ConductorMessage, PilotMessage, PlanLeft
+from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, Telemetry, Triple
+
+STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stand
+TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
+PILOT_SILENT = 0.5  # s without a message of a pilot whose vehicle has passed preflight
+START_LEAD = 0.5  # s from the last vehicle's readiness to the start of all, for the message to arrive
+RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
+_POSES = 32  # of each vehicle that are remembered
+_OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
+_DESCENDING, _DOWN = (Phase.LAND, Phase.DISARM, Phase.CLOSED), (Phase.DISARM, Phase.CLOSED)
+
+
+class Stage(StrEnum):
+    """The stages of a fleet's flight."""
+
+    PREFLIGHT = "preflight"
+    ARMING = "arming"
+    TAKE_OFF = "take-off"
+    FLYING = "flying"
+    BRAKING = "braking"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True)
+class ConductedFlight:
+    """A vehicle of the fleet, as the conductor knows it."""
+
+    name: str
+    start: Triple  # m, where its plan begins
+    delay: float  # s after the fleet's start at which its plan begins
+
+
+@dataclass(frozen=True, slots=True)
+class FlightEnded:
+    """A pilot has ended, in order or not."""
+
+    exit_code: ExitCode
+    reason: str
+
+
+@dataclass
+class _Vehicle:
+    """What is known of a vehicle."""
+
+    flight: ConductedFlight
+    asked: set[Phase] = field(default_factory=set)
+    cleared: dict[Phase, float] = field(default_factory=dict)
+    heard: float = -math.inf  # s, when its pilot was heard last
+    poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
+    stood: Triple | None = None  # m, when it passed preflight
+    descending: bool = False
+    down: bool = False  # its motors are off
+    left: bool = False  # its plan, for whatever reason
+    ended: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.flight.name
+
+    @property
+    def risen(self) -> bool:
+        return self.stood is not None and self.poses[-1].position[2] - self.stood[2] > RISEN
+
+    def place(self, time: float) -> Triple:
+        """Return where it was at a time, s, between two of its poses."""
+        times = [pose.time for pose in self.poses]
+        x, y, z = (float(np.interp(time, times, [pose.position[axis] for pose in self.poses])) for axis in range(3))
+        return x, y, z
+
+
+class Conductor:
+    """Decides when each vehicle may arm, take off and begin, and when all brake."""
+
+    def __init__(self, flights: Sequence[ConductedFlight], apart: float):
+        self._vehicles = {flight.name: _Vehicle(flight) for flight in flights}
+        self._apart = apart  # m between columns, as certified
+        self.brakes = ""  # why all brake; the first reason stays
+        self.begins = math.inf  # s, when the fleet's clock is at 0
+        self.nearest = math.inf  # m between the columns of two vehicles in the air, so far
+
+    @property
+    def stage(self) -> Stage:
+        """Return how far the flight has come."""
+        vehicles = self._vehicles.values()
+        if all(vehicle.ended for vehicle in vehicles):
+            return Stage.ENDED
+        if self.brakes:
+            return Stage.BRAKING
+        if self.begins < math.inf:
+            return Stage.FLYING
+        if any(Phase.TAKE_OFF in vehicle.cleared for vehicle in vehicles):
+            return Stage.TAKE_OFF
+        return Stage.ARMING if any(vehicle.cleared for vehicle in vehicles) else Stage.PREFLIGHT
+
+    def hear(self, name: str, message: PilotMessage | FlightEnded | Telemetry, now: float) -> None:
+        """Take what a vehicle's pilot says at a time, s."""
+        vehicle = self._vehicles[name]
+        vehicle.heard = now
+        match message:
+            case PoseReceived():
+                vehicle.poses.append(message)
+            case PhaseEntered(phase=phase):
+                vehicle.descending |= phase in _DESCENDING
+                vehicle.down |= phase in _DOWN
+            case ClearanceAsked(phase=phase):
+                vehicle.asked.add(phase)
+            case PlanLeft(reason=reason):
+                vehicle.left = True
+                self._brake(f"{name}: {reason}")
+            case FlightEnded(exit_code=exit_code, reason=reason):
+                vehicle.ended = True
+                if exit_code is not ExitCode.OK:
+                    self._brake(f"{name}: {reason}")
+
+    def say(self, now: float) -> Mapping[str, ConductorMessage]:
+        """Return what each vehicle that still flies is told at a time, s. Call it a hundred times a second."""
+        self._watch(now)
+        if not self.brakes:
+            self._clear(now)
+        return {
+            vehicle.name: ConductorMessage(dict(vehicle.cleared), self._reason_for(vehicle))
+            for vehicle in self._vehicles.values()
+            if not vehicle.ended
+        }
+
+    def _reason_for(self, vehicle: _Vehicle) -> str:
+        """Return why a vehicle must brake; one that has flown its plan lands anyway."""
+        return "" if vehicle.descending and not vehicle.left else self.brakes
+
+    def _brake(self, reason: str) -> None:
+        self.brakes = self.brakes or reason
+
+    # What ends the flight of all.
+
+    def _watch(self, now: float) -> None:
+        flying = [vehicle for vehicle in self._vehicles.values() if Phase.ARM in vehicle.asked and not vehicle.ended]
+        for vehicle in flying:
+            if not vehicle.down and now - vehicle.heard > PILOT_SILENT:
+                self._brake(f"{vehicle.name}: its pilot has been silent for {PILOT_SILENT:g} s")
+        for a, b in itertools.combinations(flying, 2):
+            self._watch_pair(a, b, now)
+
+    def _watch_pair(self, a: _Vehicle, b: _Vehicle, now: float) -> None:
+        """Compare two vehicles of which one at least flies, at the newest moment at which both were seen."""
+        if not (a.risen or b.risen) or now - min(a.poses[-1].time, b.poses[-1].time) > _OLD:
+            return
+        moment = min(a.poses[-1].time, b.poses[-1].time)
+        distance = math.dist(a.place(moment)[:2], b.place(moment)[:2])
+        self.nearest = min(self.nearest, distance)
+        allowed = self._apart - 2.0 * TRACKING
+        if distance < allowed:
+            self._brake(f"{a.name} and {b.name} are {distance:.2f} m apart, which must be {allowed:.2f} m")
+
+    # What lets it go on.
+
+    def _clear(self, now: float) -> None:
+        """Clear what all vehicles are ready for."""
+        vehicles = list(self._vehicles.values())
+        if self._all_wait_for(Phase.ARM):
+            self._take_places(vehicles)
+            if not self.brakes:
+                for vehicle in vehicles:
+                    vehicle.cleared[Phase.ARM] = now
+        if all(Phase.TAKE_OFF in vehicle.asked for vehicle in vehicles):
+            waiting = [vehicle for vehicle in vehicles if Phase.TAKE_OFF not in vehicle.cleared]
+            if waiting and all(vehicle.risen for vehicle in vehicles if vehicle not in waiting):
+                waiting[0].cleared[Phase.TAKE_OFF] = now
+        if self._all_wait_for(Phase.STREAM):
+            self.begins = now + START_LEAD
+            for vehicle in vehicles:
+                vehicle.cleared[Phase.STREAM] = self.begins + vehicle.flight.delay
+
+    def _all_wait_for(self, phase: Phase) -> bool:
+        return all(phase in vehicle.asked and phase not in vehicle.cleared for vehicle in self._vehicles.values())
+
+    def _take_places(self, vehicles: Sequence[_Vehicle]) -> None:
+        """Note where all stand, and end the flight on the floor unless each stands under its start, apart."""
+        for vehicle in vehicles:
+            vehicle.stood = vehicle.poses[-1].position
+            beside = math.dist(vehicle.stood[:2], vehicle.flight.start[:2])
+            if not beside <= STANDS_WITHIN:
+                self._brake(
+                    f"{vehicle.name} stands {beside:.2f} m beside its start at "
+                    f"({vehicle.flight.start[0]:.2f}, {vehicle.flight.start[1]:.2f}) m, at most {STANDS_WITHIN:g} m"
+                )
+        for a, b in itertools.combinations(vehicles, 2):
+            assert a.stood is not None
+            assert b.stood is not None
+            distance = math.dist(a.stood[:2], b.stood[:2])
+            if not distance >= self._apart - 2.0 * TRACKING:
+                self._brake(f"{a.name} and {b.name} stand {distance:.2f} m apart, which must be {self._apart:g} m")
