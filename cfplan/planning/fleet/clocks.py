@@ -54,14 +54,17 @@ def cells_of(duration: float) -> NDArray:
     return CELL * np.arange(int(np.ceil(duration / CELL)) + LEVELS)
 
 
-def fastest_clock(own: NDArray, others: NDArray, apart: float) -> VehicleClock | Stuck:
+def fastest_clock(
+    own: NDArray, others: NDArray, apart: float, hazard: NDArray, may_start: NDArray
+) -> VehicleClock | Stuck:
     """Return the clock that reaches the end soonest, `apart`, m, from all others.
 
     `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan; `others`, (K, T, W, 2) m, are those of K
-    vehicles whose flights are known, at W moments of the skew about each tick until all rest.
+    vehicles whose flights are known, at W moments of the skew about each tick until all rest. It also keeps out of
+    `hazard`, (T, U) bool, and does not start at ticks other than those in `may_start`, (T,) bool.
     """
-    conflict = _conflicts(own, others, apart)
-    how, end, cell, level = _reached(conflict)
+    conflict = _conflicts(own, others, apart) | hazard
+    how, end, cell, level = _reached(conflict, may_start)
     if level > 0:
         return VehicleClock(*_followed(how, end, cell, level))
     found = how.any(axis=2)
@@ -83,7 +86,7 @@ def _conflicts(own: NDArray, columns: NDArray, apart: float) -> NDArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
+def _reached(conflict: NDArray, may_start: NDArray) -> tuple[NDArray, int, int, int]:
     """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the soonest end.
 
     The level is 0 where no end is reached.
@@ -97,7 +100,7 @@ def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
         stays[t] = stays[t + 1] and _free(conflict, t, end)
     for t in range(ticks):
         if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, t, 0):
-            for level in range(LEVELS + 1):
+            for level in range(LEVELS + 1 if may_start[min(t, known - 1)] else 1):
                 how[t, 0, level] |= _START
         for u in range(cells):
             for level in range(LEVELS, 0, -1):

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.random_paths import generator
 from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_of, fastest_clock
+from cfplan.planning.fleet.hazards import Hazards
+from cfplan.planning.fleet.lost import Loss, LossModel
 from cfplan.planning.fleet.members import FleetMember, places
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
@@ -63,6 +65,13 @@ class _Track:
         assert self.clock is not None
         return TICK * (len(self.clock.own) - 1)
 
+    @property
+    def delay(self) -> float:
+        if self.member is not None:
+            return self.member.delay
+        assert self.clock is not None
+        return self.clock.delay
+
     def own(self, times: NDArray) -> NDArray:
         """Return the own time of the plan before coordination at times of all, s."""
         if self.member is not None:
@@ -77,13 +86,15 @@ class _Track:
 
 
 def coordinate(
-    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish
+    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish, lost: LossModel | None = None
 ) -> tuple[FleetMember, ...] | Blocked:
     """Return the members with delays and slower plans, whose columns stay `apart`, m, for clocks `skew`, s, apart.
 
-    `finish` is applied to each plan that is made slower, before it is compared with others.
+    `finish` is applied to each plan that is made slower, before it is compared with others. With a model of lost
+    vehicles, the others also keep away from these.
     """
-    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish)
+    hazards = None if lost is None else Hazards.of(members, lost, skew)
+    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish, lost, hazards)
     found: list[tuple[float, tuple[int, ...]]] = []
     blocked: Blocked | None = None
     longest = max(member.plan.trajectory.duration for member in members)
@@ -140,6 +151,8 @@ class _Search:
     skew: float  # s
     at_rest: float  # m, from start to start and from end to end, which no clock changes
     finish: Finish
+    lost: LossModel | None = None
+    hazards: Hazards | None = None
 
     def sketch(self, order: tuple[int, ...]) -> list[_Track] | Blocked:
         """Return clocks in an order, without planning again."""
@@ -159,7 +172,9 @@ class _Search:
             if isinstance(made, Blocked):
                 return made
             tracks.append(made)
-        return tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+        members = tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+        nearest = self._nearest_loss(members, range(len(members)))
+        return members if nearest is None else _blocked_by(nearest)
 
     def _track(self, number: int, tracks: list[_Track]) -> _Track | Blocked:
         """Return the flight of a vehicle that keeps apart from the tracks of others."""
@@ -176,9 +191,16 @@ class _Search:
                 blocked = self._blocked(number, Stuck(CELL * float(clock.own[slows]), TICK * slows), tracks)
                 continue
             nearest = _nearest(made, tracks, self.skew)
-            if nearest is None or nearest.keeps(self.apart):
+            if nearest is not None and not nearest.keeps(self.apart):
+                blocked = _blocked_by(nearest)
+                continue
+            near = [
+                self._nearest_loss((made, track.member), (number, track.number)) for track in tracks if track.member
+            ]
+            lost = min((each for each in near if each), key=lambda each: each.distance, default=None)
+            if lost is None:
                 return _Track(number, member.plan.trajectory, None, made)
-            blocked = Blocked(nearest.pair, nearest.place, nearest.time)
+            blocked = _blocked_by(lost)
         assert blocked is not None
         return blocked
 
@@ -193,8 +215,21 @@ class _Search:
         others = np.zeros((len(tracks), len(ticks), len(band), 2))
         for row, track in zip(others, tracks, strict=True):
             row[:] = track.columns(ticks[:, None] + band)
-        clock = fastest_clock(own, others, min(self.apart + slack, max(self.at_rest, self.apart)))
+        hazard, may_start = np.zeros((len(ticks), len(own)), dtype=np.bool_), np.ones(len(ticks), dtype=np.bool_)
+        if self.hazards is not None:
+            for track in tracks:
+                times = np.where(ticks < track.delay, ticks - track.delay, track.own(ticks))
+                self.hazards.mark(hazard, may_start, (number, track.number), times, slack)
+        keeps = min(self.apart + slack, max(self.at_rest, self.apart))
+        clock = fastest_clock(own, others, keeps, hazard, may_start)
         return clock if isinstance(clock, VehicleClock) else self._blocked(number, clock, tracks)
+
+    def _nearest_loss(self, members: Sequence[FleetMember], numbers: Sequence[int]) -> Loss | None:
+        """Return the lost vehicle that comes nearest to another, if it comes too near."""
+        if self.lost is None:
+            return None
+        nearest = self.lost.losses(members, numbers, self.skew)[0]
+        return None if nearest.keeps(self.lost.clearance) else nearest
 
     def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
         """Return where a vehicle is stuck, and which of the others is nearest to where it would go."""
@@ -209,6 +244,11 @@ def _distance_at_rest(members: Sequence[FleetMember]) -> float:
     """Return the least distance, m, from start to start or from end to end."""
     ends = np.stack([member.plan.path(np.array([0.0, member.plan.path.end]))[:, :2] for member in members])
     return min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(ends, 2)), default=np.inf)
+
+
+def _blocked_by(near: Separation | Loss) -> Blocked:
+    """Return which pair comes too near, as the reason why a vehicle gets no farther."""
+    return Blocked(near.pair, near.place, near.time)
 
 
 def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation | None:
