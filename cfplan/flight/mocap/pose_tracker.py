@@ -191,7 +191,7 @@ class PoseTracker:
         return None if position is None or turned is None else (position, turned)
 
     def heights(self, since: float) -> list[float]:
-        """Return the heights, m, of the good poses after a time, s; none if they do not reach back to then."""
+        """Return the heights, m, of the good poses after a time, s; none if they reach back less."""
         heights = [pose.position[2] for pose in self.recent if pose.time > since]
         return heights if len(heights) >= _MIN_HEIGHTS and self.recent[0].time <= since else []
 
