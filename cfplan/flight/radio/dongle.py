@@ -28,7 +28,7 @@ class Dongle:
     """A link to one vehicle over a Crazyradio."""
 
     def __init__(self, radio: Any, clock: Clock = REAL_CLOCK, period: float = 0.0):
-        """Take a `cflib.drivers.crazyradio.Crazyradio` that is tuned; `period`, s, is the least time per transmission."""
+        """Take a `cflib.drivers.crazyradio.Crazyradio` that is tuned; `period`, s, is the least time each."""
         self._radio, self._clock, self._period = radio, clock, period
         self._outbox, self._changed = Outbox(), threading.Condition()
         self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
