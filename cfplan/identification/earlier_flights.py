@@ -28,7 +28,9 @@ from cfplan.vehicle.trajectory import Trajectory
 
 SPACING = 0.25  # s between knots of a correction, which has a bandwidth of 2 Hz (see docs/flying.md)
 LARGEST = 0.2  # m; a vehicle with a larger deviation does not match its airframe
-HOVER = 0.5  # s of hover after the end of the path that count as flight
+# s of hover after the end that count as flight, about as long as the pilot holds it. The shift at the end also applies
+# there, while a vehicle that lagged by 4 cm arrives within half a second and would be displaced by all of it.
+HOVER = 1.5
 _ENOUGH = 3  # flights needed to separate repeated deviation from chance
 _CHANCE = 2.0  # times the variance expected by chance; a larger one repeats
 _FLOWN_HINT = "name records of flights that flew the whole plan and landed"
