@@ -29,7 +29,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
-AFTERWARDS = 1.0  # s simulated after the gap
+AFTERWARDS = 2.0  # s simulated after the gap: at little thrust a vehicle may stray for 1.5 s until it is lost
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
 WITHOUT_POSES_EVERY = 5  # setpoints
