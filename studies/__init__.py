@@ -8,7 +8,7 @@ STUDIES = {
     for name in (
         "blind_link_loss", "dry_runs", "exports", "faults", "fleets", "flights", "giving_way", "horizon",
         "identification", "lateness", "latency", "link_loss", "physics", "planners", "random_faults", "real_flights",
-        "steering", "stops", "waypoints",
+        "second_flights", "steering", "stops", "waypoints",
         "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
         "paper.search", "paper.simulators", "paper.yaw_consistency",
     )

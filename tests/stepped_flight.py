@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from cfplan.errors import CfplanError
+from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.keys import HeldOrders, Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -61,6 +62,7 @@ def fly_stepped(
     orders: HeldOrders | None = None,
     more_orders: Callable[[], Sequence[Order]] = tuple,
     proposals: ProposalSource = NO_PROPOSALS,
+    conductor: ConductorSource = NO_CONDUCTOR,
 ) -> Flight:
     """Fly; `react` sees each message as it comes. What the main process would raise is raised."""
     lab, orders = lab or SteppedLab(mission.limits.airframe), orders or HeldOrders()
@@ -83,6 +85,7 @@ def fly_stepped(
             report=report,
             orders=orders,
             proposals=proposals,
+            conductor=conductor,
             clock=lab.clock,
         )
         last: FlightOutcome | CfplanError

@@ -1,5 +1,6 @@
 """Commands on a fleet file: plan, check and rehearse all vehicles together."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,14 +19,15 @@ def is_fleet(file: Path) -> bool:
     return is_fleet_file(file)
 
 
-def refuse_flight(file: Path) -> None:
-    """Raise InputError for a fleet file."""
-    if is_fleet(file):
-        raise InputError(
-            "fleets are planned and checked, but not flown yet",
-            where=str(file),
-            hint="`cfplan check` rehearses them; fly the path file of one vehicle",
-        )
+def refuse_flight_options(given: Mapping[str, bool]) -> None:
+    """Raise InputError for an option of `fly` that a fleet does not have; `given` says which are given."""
+    for name, is_given in given.items():
+        if is_given:
+            raise InputError(
+                f"fleets do not fly with {name} yet",
+                where=name,
+                hint="leave it out; `uri` and `body` of each vehicle stand in the fleet file",
+            )
 
 
 def refuse_output(output: Path | None, figure: Path | None) -> None:

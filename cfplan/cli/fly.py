@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from cfplan.cli import fleet, options
 from cfplan.cli.fly_waypoints import fly_waypoints
@@ -104,7 +105,8 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    fleet.refuse_flight(path_or_plan)
+    if fleet.is_fleet(path_or_plan):
+        return _fly_fleet(path_or_plan, safety_file, records, planning, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
@@ -118,6 +120,22 @@ def fly(
         flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     _print_result(prepared, flown, as_json)
     return int(flown.outcome.exit_code)
+
+
+def _fly_fleet(
+    file: Path, safety_file: Path | None, records: Path, planning: dict[str, Any], steps: Steps
+) -> int:  # fmt: skip
+    """Fly a fleet file. Raises InputError for options that a fleet does not have."""
+    context = click.get_current_context()
+    given = {
+        f"--{name.removesuffix('_uri').replace('_', '-')}": context.get_parameter_source(name)
+        is ParameterSource.COMMANDLINE
+        for name in ("uri", "mocap_uri", "on_board", "after", "live", "mavlink")
+    }
+    fleet.refuse_flight_options(given)
+    with steps.waiting("loading planners and simulator"):
+        from cfplan.cli.fleet_flight import fly_fleet
+    return fly_fleet(file, safety_file, records, planning, steps)
 
 
 def _preparation(

@@ -9,5 +9,6 @@ __all__ = [
     "starting_vehicle",
     "steered_vehicle",
     "stepped_steering",
+    "virtual_room",
     "waypoint_lines",
 ]

@@ -13,6 +13,7 @@ from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, LinkError
 from cfplan.flight.mocap.source import pose_source
+from cfplan.flight.pilot.conducted import ConductorMessage, HeldConductor
 from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.process import fly
@@ -180,3 +181,14 @@ def test_a_lab_that_is_gone_is_an_error_with_a_hint(mission, monkeypatch):
     with pytest.raises(LinkError) as caught:
         fly(mission, uri="sim://7", drivers=[SimDriver], pose_source=source)
     assert caught.value.hint
+
+
+def test_a_conductor_that_clears_at_once_changes_nothing(whole_flight, mission, lab):
+    """A single vehicle has none, and flies the same code."""
+    conductor = HeldConductor(lambda _: None, lab.clock.now)
+    conductor.give(ConductorMessage(dict.fromkeys(Phase, 0.0)))
+
+    def beat(_):
+        conductor.heard = lab.now
+
+    assert fly_stepped(mission, beat, lab=lab, conductor=conductor).telemetry == whole_flight.telemetry

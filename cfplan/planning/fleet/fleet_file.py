@@ -1,4 +1,4 @@
-"""Fleet files: vehicles by name, each with its path, and the distance that they keep from each other.
+"""Fleet files: vehicles by name with their paths, and the distance to keep between them.
 
 apart: 0.30          # m between the vertical columns of any two vehicles
 skew: 0.03           # s by which their clocks may differ
@@ -45,7 +45,7 @@ class FleetFile:
     name: str
     vehicles: tuple[FleetVehicle, ...]
     apart: float  # m, at least, between the vertical columns of any two vehicles
-    skew: float  # s, at most, by which clocks and orders to stop differ
+    skew: float  # s, largest difference between clocks, and between the arrivals of an order to stop
     lost_only_warns: bool = False  # of a lost vehicle that may come too near to another; else the fleet is refused
 
     @property
@@ -131,7 +131,7 @@ def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterat
 
 
 def _check_pair(a: FleetVehicle, b: FleetVehicle, fleet: FleetFile, places: Places) -> None:
-    """Raise InputError if two vehicles cannot be told apart, or cannot stand beside each other."""
+    """Raise InputError if two vehicles cannot be distinguished, or stand too close to each other."""
     for key in ("uri", "body"):
         if getattr(a, key) and getattr(a, key) == getattr(b, key):
             raise InputError(

@@ -258,6 +258,6 @@ class SteppedFleet:
         while self._heard:
             name, message = self._heard.popleft()
             self._conductor.hear(name, message, now)
-        for name, message in self._conductor.say(now).items():
+        for name, order in self._conductor.say(now).items():
             if name in self._conductors and not self.labs[name].deaf:
-                self._conductors[name].give(message)
+                self._conductors[name].give(order)

@@ -1,0 +1,192 @@
+"""The conductor as a pure core: what it hears of pilots, and what it tells them."""
+
+import math
+
+import pytest
+
+from cfplan.errors import ExitCode
+from cfplan.flight.fleet.conductor import PILOT_SILENT, START_LEAD, ConductedFlight, Conductor, FlightEnded, Stage
+from cfplan.flight.pilot.conducted import CONDUCTOR_SILENT, ClearanceAsked, ConductorMessage, HeldConductor, PlanLeft
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived
+
+APART = 0.3
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+class Fleet:
+    """Two vehicles 0.5 m from each other, as their conductor hears them."""
+
+    def __init__(self, delay=0.0):
+        self.places = {"left": (0.0, 0.0, 0.0), "right": (0.5, 0.0, 0.0)}
+        starts = {name: (x, y, 0.6) for name, (x, y, _) in self.places.items()}
+        delays = {"left": 0.0, "right": delay}
+        self.conductor = Conductor([ConductedFlight(name, starts[name], delays[name]) for name in starts], APART)
+        self.now = 1000.0
+        self.silent = set()
+
+    def hear(self, name, message):
+        self.conductor.hear(name, message, self.now)
+
+    def ask(self, phase, *names):
+        for name in names or self.places:
+            self.hear(name, ClearanceAsked(phase))
+        return self.go_on(0.01)
+
+    def go_on(self, duration):
+        """Let time pass, in which both are seen a hundred times a second; return what they are told at the end."""
+        for _ in range(round(duration * 100)):
+            self.now += 0.01
+            for name, place in self.places.items():
+                if name not in self.silent:
+                    self.hear(name, PoseReceived(self.now - 0.01, self.now, place, LEVEL))
+            said = self.conductor.say(self.now)
+        return said
+
+    def rise(self, name):
+        x, y, _ = self.places[name]
+        self.places[name] = (x, y, 0.6)
+        return self.go_on(0.01)
+
+    def fly(self):
+        """Go to the start of all; return what they are told."""
+        self.go_on(0.1)
+        self.ask(Phase.ARM)
+        self.ask(Phase.TAKE_OFF)
+        for name in self.places:
+            self.rise(name)
+        return self.ask(Phase.STREAM)
+
+
+def cleared(said, phase):
+    return {name for name, message in said.items() if phase in message.cleared}
+
+
+def braking(said):
+    return {name for name, message in said.items() if message.brakes}
+
+
+def test_nothing_is_armed_until_all_have_passed_preflight():
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    assert not cleared(fleet.ask(Phase.ARM, "left"), Phase.ARM)
+    assert cleared(fleet.ask(Phase.ARM, "right"), Phase.ARM) == {"left", "right"}
+
+
+def test_a_vehicle_that_fails_preflight_keeps_all_on_the_floor():
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    fleet.ask(Phase.ARM, "left")
+    fleet.hear("right", FlightEnded(ExitCode.PREFLIGHT, "battery at rest: 3.5 V"))
+    said = fleet.go_on(0.01)
+    assert not cleared(said, Phase.ARM)
+    assert "right: battery" in said["left"].brakes
+
+
+@pytest.mark.parametrize(("place", "text"), [
+    ((0.25, 0.0, 0.0), "beside its start"), ((0.0, 0.0, 0.0), "beside its start"), ((0.5, 0.2, 0.0), "0.20 m beside"),
+])  # fmt: skip
+def test_a_vehicle_that_does_not_stand_under_its_start_keeps_all_on_the_floor(place, text):
+    fleet = Fleet()
+    fleet.places["right"] = place
+    fleet.go_on(0.1)
+    said = fleet.ask(Phase.ARM)
+    assert braking(said) == {"left", "right"}
+    assert not cleared(said, Phase.ARM)
+    assert text in said["left"].brakes
+
+
+def test_the_next_takes_off_when_the_one_before_has_risen():
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    fleet.ask(Phase.ARM)
+    assert cleared(fleet.ask(Phase.TAKE_OFF), Phase.TAKE_OFF) == {"left"}
+    assert cleared(fleet.go_on(2.0), Phase.TAKE_OFF) == {"left"}
+    assert cleared(fleet.rise("left"), Phase.TAKE_OFF) == {"left", "right"}
+
+
+def test_all_begin_at_one_time_each_after_its_delay():
+    fleet = Fleet(delay=0.7)
+    said = fleet.fly()
+    begins = fleet.conductor.begins
+    assert begins == pytest.approx(fleet.now + START_LEAD)
+    assert said["left"].cleared[Phase.STREAM] == begins
+    assert said["right"].cleared[Phase.STREAM] == begins + 0.7
+    assert fleet.go_on(1.0)["left"].cleared[Phase.STREAM] == begins
+    assert fleet.conductor.stage is Stage.FLYING
+    assert not braking(said)
+
+
+def test_all_brake_when_one_leaves_its_plan():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.hear("left", PlanLeft(Rung.BRAKE, "the last good pose is 0.20 s old"))
+    said = fleet.go_on(0.01)
+    assert braking(said) == {"left", "right"}
+    assert "left: the last good pose" in said["right"].brakes
+    assert fleet.conductor.stage is Stage.BRAKING
+
+
+def test_one_that_lands_at_its_end_goes_on_landing():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.hear("right", PhaseEntered(fleet.now, Phase.LAND))
+    fleet.hear("left", PlanLeft(Rung.BRAKE, "late"))
+    assert braking(fleet.go_on(0.01)) == {"left"}
+
+
+def test_one_that_has_landed_is_no_reason_to_brake():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.hear("right", FlightEnded(ExitCode.OK, "landed"))
+    fleet.silent.add("right")
+    said = fleet.go_on(1.0)
+    assert set(said) == {"left"}
+    assert not braking(said)
+
+
+def test_all_brake_when_a_pilot_is_silent():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.silent.add("right")
+    assert not braking(fleet.go_on(PILOT_SILENT - 0.05))
+    assert braking(fleet.go_on(0.1)) == {"left", "right"}
+    assert "right" in fleet.conductor.brakes
+
+
+@pytest.mark.parametrize(("distance", "brakes"), [(0.21, False), (0.19, True)])
+def test_all_brake_below_the_distance_that_tracking_leaves_at_any_height(distance, brakes):
+    fleet = Fleet()
+    fleet.fly()
+    fleet.places["right"] = (distance, 0.0, 2.0)
+    assert bool(braking(fleet.go_on(0.02))) is brakes
+    assert fleet.conductor.nearest == pytest.approx(distance)
+
+
+def test_a_vehicle_seen_later_than_another_is_compared_at_one_moment():
+    fleet = Fleet()
+    fleet.fly()
+    for step in range(1, 40):  # both move at 2 m/s; the right one is seen 0.1 s late, 0.2 m nearer than it is
+        fleet.now += 0.01
+        fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.02 * step, 0.0, 0.6), LEVEL))
+        if step > 10:
+            seen = 0.5 + 0.02 * (step - 10)
+            fleet.hear("right", PoseReceived(fleet.now - 0.1, fleet.now, (seen, 0.0, 0.6), LEVEL))
+        said = fleet.conductor.say(fleet.now)
+    assert not braking(said)
+    assert fleet.conductor.nearest > 0.45
+
+
+def test_a_pilot_that_does_not_hear_its_conductor_brakes():
+    now = 0.0
+    told = []
+    held = HeldConductor(told.append, lambda: now)
+    held.give(ConductorMessage({Phase.ARM: 0.5}))
+    assert held.clearance(Phase.ARM) == 0.5
+    assert held.clearance(Phase.STREAM) == math.inf
+    assert not held.brakes(CONDUCTOR_SILENT - 0.01)
+    assert "silent" in held.brakes(CONDUCTOR_SILENT + 0.01)
+    held.give(ConductorMessage({}, "left: late"))
+    assert held.brakes(CONDUCTOR_SILENT + 0.01) == "left: late"
+    held.ask(Phase.ARM)
+    assert told == [ClearanceAsked(Phase.ARM)]

@@ -1,0 +1,210 @@
+"""Fleets in the stepped lab: they start together, and with one fault none touches another and all come down."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from septic_flight import septic_payloads
+from stepped_flight import fly_stepped
+
+from cfplan.errors import ExitCode
+from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.mission import Mission
+from cfplan.flight.setpoints.packets import decode, encode
+from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.flight.telemetry import Phase, PhaseEntered
+from cfplan.safety.limits import GroundManoeuvres
+from cfplan.safety.limits_file import load_limits
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.stepped_fleet import SteppedFleet
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_crazyflie.supervisor import State
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
+
+pytestmark = pytest.mark.integration
+
+QUICK = GroundManoeuvres(take_off_height=0.5, take_off_speed=0.6, go_to_speed=0.6, land_speed=0.6)
+LIMITS = replace(load_limits(Path(__file__).parents[3] / "safety.yaml"), ground=QUICK)
+APART = 0.3
+DISARMED = (State.CHECKS_NOT_PASSED, State.CHECKS_PASSED, State.RESET, State.LOCKED, State.CRASHED)
+
+
+def mission(y: float) -> Mission:
+    """1.2 m along x at this y, in 2.5 s."""
+    setpoints = decode(septic_payloads(1.2, 2.5, 0.6))
+    moving = encode(replace(setpoints, position=setpoints.position + np.array((0.0, y, 0.0))))
+    payloads = np.concatenate([moving, np.repeat(moving[-1:], 30, axis=0)])
+    return Mission(payloads, encode_stops(decode(payloads), 100.0), LIMITS, hold_time=0.3)
+
+
+MISSIONS = {"left": mission(0.0), "right": mission(0.45)}
+
+
+OWN = {  # they do not arm themselves, so that the last state says whether they were disarmed
+    name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
+    for name, each in MISSIONS.items()
+}
+
+
+def fleet_of(missions=MISSIONS, settings=None, delays=None):
+    flights = [ConductedFlight(name, each.start[0], (delays or {}).get(name, 0.0)) for name, each in missions.items()]
+    return SteppedFleet(missions, Conductor(flights, APART), settings=settings or OWN)
+
+
+def streaming(fleet, name, moment, act):
+    """Return a reaction that acts once, in that pilot's turn, a moment, s, after its plan has begun."""
+    done = False
+
+    def react(whose, message):
+        nonlocal done
+        if not done and whose == name and isinstance(message, PhaseEntered) and message.phase is Phase.STREAM:
+            done = True
+            clock = fleet.labs[name].clock
+            clock.at(clock.now() + moment, act)
+
+    return react
+
+
+def assert_down(flight):
+    """None touched another, and all are on the floor, disarmed, their motors off."""
+    assert not flight.contacts
+    for name, truth in flight.truths.items():
+        assert truth.position[-1, 2] < 0.05, name
+        assert not truth.motor[-1].any(), name
+        assert truth.supervisor[-1] in DISARMED, name
+
+
+def begun(flight):
+    return {name: outcome.first_setpoint for name, outcome in flight.outcomes.items()}
+
+
+@pytest.fixture(scope="module")
+def whole_flight():
+    return fleet_of(delays={"left": 0.0, "right": 0.25}).fly()
+
+
+def test_a_fleet_starts_together_and_lands(whole_flight):
+    assert set(whole_flight.exit_codes.values()) == {ExitCode.OK}
+    starts = begun(whole_flight)
+    assert starts["right"] - starts["left"] == pytest.approx(0.25, abs=0.01)
+    assert not whole_flight.brakes
+    assert whole_flight.nearest > APART
+    assert_down(whole_flight)
+    for outcome in whole_flight.outcomes.values():
+        assert outcome.deviation.max < 0.08
+
+
+def test_nothing_is_armed_before_all_have_passed_preflight(whole_flight):
+    phases = {name: dict(outcome.phases) for name, outcome in whole_flight.outcomes.items()}
+    assert min(each[Phase.ARM] for each in phases.values()) > max(each[Phase.PREFLIGHT] for each in phases.values())
+
+
+def test_a_lost_link_lets_the_other_brake():
+    fleet = fleet_of()
+    lab = fleet.labs["left"]
+    flight = fleet.fly(streaming(fleet, "left", 0.6, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD))))
+    assert flight.exit_codes["left"] is ExitCode.LINK_LOST
+    assert "left" in flight.reasons["right"]
+    assert_down(flight)
+    stopped = max(flight.truths["right"].position[:, 0])
+    assert stopped < 0.5  # of 0.6: it did not fly to its end
+
+
+def test_pilots_whose_conductor_dies_brake_and_land():
+    fleet = fleet_of()
+
+    def die():
+        fleet.conductor_dies_at = fleet.labs["left"].now
+
+    flight = fleet.fly(streaming(fleet, "left", 0.2, die))
+    assert all("silent" in reason for reason in flight.reasons.values())
+    assert_down(flight)
+
+
+def kill_pilot(fleet):
+    fleet.labs["left"].kill_pilot()
+
+
+def lose_poses(fleet):
+    fleet.labs["left"].disturb(ViconFault(FaultKind.OCCLUDE))
+
+
+def tumble(fleet):
+    fleet.labs["left"].disturb(VehicleFault(VehicleFaultKind.TUMBLE))
+
+
+def sag(fleet):
+    fleet.labs["left"].disturb(VehicleFault(VehicleFaultKind.BATTERY, 0.0, 60.0, 3.0))
+
+
+def stall(fleet):
+    fleet.labs["left"].clock.stall(0.6)
+
+
+def land(fleet):
+    fleet.labs["left"].orders.give(Order.LAND)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [0.2, 0.8, 1.3])
+@pytest.mark.parametrize("fault", [kill_pilot, lose_poses, tumble, sag, stall, land])
+def test_with_one_fault_none_touches_another_and_all_come_down(fault, moment):
+    fleet = fleet_of()
+    flight = fleet.fly(streaming(fleet, "left", moment, lambda: fault(fleet)))
+    assert flight.brakes.startswith("left")
+    assert flight.reasons["right"].startswith("the fleet brakes: left")
+    assert_down(flight)
+
+
+@pytest.mark.slow
+def test_a_pilot_that_the_order_does_not_reach_brakes_by_itself():
+    fleet = fleet_of()
+
+    def lose_both():
+        fleet.labs["right"].deaf = True
+        lose_poses(fleet)
+
+    flight = fleet.fly(streaming(fleet, "left", 0.5, lose_both))
+    assert "silent" in flight.reasons["right"]
+    assert_down(flight)
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_does_not_arm_keeps_the_other_on_the_floor():
+    fleet = fleet_of()
+    locks = VehicleFault(VehicleFaultKind.LOCK)
+
+    def react(name, message):
+        if name == "left" and isinstance(message, PhaseEntered) and message.phase is Phase.ARM:
+            fleet.labs["left"].disturb(locks)
+
+    flight = fleet.fly(react)
+    assert flight.exit_codes["left"] is ExitCode.PREFLIGHT
+    assert all(truth.position[:, 2].max() < 0.02 for truth in flight.truths.values())
+    assert_down(flight)
+
+
+@pytest.mark.slow
+def test_swapped_bodies_are_noticed_while_one_vehicle_takes_off():
+    fleet = fleet_of()
+    left, right = fleet.labs["left"], fleet.labs["right"]
+    left.body, right.body = right, left
+    flight = fleet.fly()
+    assert flight.brakes
+    assert flight.truths["right"].position[:, 2].max() < 0.02
+    assert flight.truths["left"].position[:, 2].max() < 0.3
+    assert_down(flight)
+
+
+def test_a_vehicle_among_others_flies_as_one_alone():
+    """Until the conductor makes it wait, to the last bit: sharing a clock changes nothing."""
+    fleet = fleet_of()
+    shared = fleet.fly().telemetry["left"]
+    alone = fly_stepped(MISSIONS["left"], lab=SteppedLab(LIMITS.airframe, vehicle=OWN["left"])).telemetry
+    armed = next(message for message in alone if isinstance(message, PhaseEntered) and message.phase is Phase.ARM)
+    assert [each for each in shared if each.time < armed.time] == [each for each in alone if each.time < armed.time]
+    assert len([each for each in shared if each.time < armed.time]) > 300
