@@ -25,9 +25,10 @@ from cfplan.planning.fleet.members import FleetMember, places
 from cfplan.planning.plan_result import Plan
 from cfplan.safety.space import inside
 
-NOTICED = (0.4, 0.6)  # s, soonest and latest, from the last setpoint until the others begin to brake
-"""The uplink counts as gone after 0.5 s without an answer to pings, which are sent each 0.1 s (flight/pilot/health.py):
-0.4 to 0.5 s after the last setpoint. The conductor's tick and its orders take 0.1 s at most."""
+NOTICED = (0.0, 0.6)  # s, soonest and latest, from the last setpoint until the others begin to brake
+"""The conductor hears at once of a pilot that ends its flight or dies. A lost link is known to the pilot 0.4 to 0.5 s
+after the last setpoint: answers to pings, ten a second, must be missing for 0.5 s (flight/pilot/health.py). A hanging
+pilot is noticed after 0.5 s. The conductor's tick and its orders take 0.1 s at most."""
 _SAMPLE = 0.005  # s of a plan, from one compared place to the next
 _BETWEEN = 1e-4  # m, as in separation.py
 REACTIONS = ("the others brake", "the others fly on")

@@ -55,11 +55,10 @@ def coordinated(crossing, model):
 def stopping(member, encoded, loss: float, begins: float, late: float) -> np.ndarray:
     """The places, (M, 2) m at each 10 ms after a loss, of a vehicle that brakes then by a clock that is late."""
     motion = encoded(member.plan).motion
-    own = np.round((loss + late - member.delay + np.arange(0.0, begins, 0.01)) * RATE).astype(int)
-    before = motion.position[np.clip(own, 0, len(motion.position) - 1)]
-    row = np.array([int(np.clip(own[-1] + 1, 0, len(motion.position) - 1))])
-    stops, _ = stop_motion(motion, row, RATE)
-    return np.concatenate([before, stops.position])[:, :2]
+    own = np.round((loss + late - member.delay) * RATE) + np.arange(round(begins * RATE) + 1)
+    rows = np.clip(own, 0, len(motion.position) - 1).astype(int)
+    stops, _ = stop_motion(motion, rows[-1:], RATE)
+    return np.concatenate([motion.position[rows[:-1]], stops.position])[:, :2]
 
 
 def apart(way: np.ndarray, others: np.ndarray) -> float:
@@ -89,7 +88,7 @@ def test_the_certified_distance_is_never_above_that_of_simulations(coordinated, 
         payloads, least = encoded(lost.plan).payloads, np.inf
         for row in range(0, len(payloads), 20):
             ways = [fly_on(payloads, limits.airframe, row, lag=lag, off_after=off) for off in (0, 1040)]
-            for begins, late in zip((NOTICED[0], 0.5, NOTICED[1]), (-SKEW, 0.0, SKEW), strict=True):
+            for begins, late in zip((NOTICED[0], 0.4, NOTICED[1]), (-SKEW, 0.0, SKEW), strict=True):
                 others = stopping(other, encoded, lost.delay + row / RATE, begins, late)
                 least = min(least, *(apart(way, others) for way in ways))
         assert CLEARANCE <= of_vehicle[lost.name].distance < least + 0.01
