@@ -75,3 +75,6 @@ def _planned(file: Path, safety_file: Path | None, planning: dict[str, Any], ste
 def _print_tables(fleet: "PlannedFleet") -> None:
     print_table("Vehicles", ["vehicle", "starts", "ends", "slower"], fleet.vehicle_rows())
     print_table("Separation: passed", ["pair", "nearest", "allowed", "at", "where, m"], fleet.pair_rows())
+    verdict = "passed" if fleet.losses[0].keeps(fleet.lost_keep) else "not passed"
+    columns = ["lost", "nearest pair", "distance", "allowed", "lost at", "where, m", "then", "nearer for"]
+    print_table(f"Lost vehicles: {verdict}", columns, fleet.loss_rows())

@@ -12,7 +12,7 @@ STREAM_PRIORITY = 20  # of SCHED_FIFO, for the thread that sends setpoints
 # MCL_CURRENT, MCL_FUTURE, MCL_ONFAULT of mlockall(2): every page, now and later, once it is used
 _LOCK_ALL_IN_USE = 1 | 2 | 4
 _SHORTEST_SLICE = 100_000  # ns, the shortest that Linux grants
-# numbers of the system call, which has no name in older C libraries
+# numbers of the system call, for which older C libraries have no name
 _SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 # struct sched_attr: size, policy, flags, nice, priority, runtime, deadline, period
 _SCHED_ATTR = struct.Struct("=IIQiIQQQ")
@@ -33,10 +33,10 @@ def use_fifo_scheduling(priority: int = STREAM_PRIORITY, thread: int = 0) -> boo
 
 
 def shorten_time_slice(thread: int = 0) -> bool:
-    """Let a thread of this process wait less for the processor, for shorter turns on it; return if granted.
+    """Shorten the time slice of a thread of this process, so that it waits less; return if granted.
 
-    Needs no permission, unlike `use_fifo_scheduling`. Linux has per-thread time slices from 6.12 on; an older one
-    grants this and does nothing.
+    Unlike `use_fifo_scheduling` this needs no permission. Linux has per-thread time slices from 6.12 on; older kernels
+    accept the call and ignore it.
     """
     number = _SCHED_SETATTR.get(platform.machine()) if sys.platform.startswith("linux") else None
     if number is None:
@@ -64,14 +64,14 @@ def may_use_fifo_scheduling() -> bool:
 def lock_memory() -> bool:
     """Keep the pages that this process uses in memory; return if permitted.
 
-    A system that trims its caches takes the pages of code that runs once a second, and reading them back takes
+    Otherwise a system that trims its caches may drop code that runs once a second, and reading it back takes
     milliseconds.
     """
     if not sys.platform.startswith("linux"):
         return False
     import resource
 
-    # Under a limit that is not reached yet, some allocation in flight would be refused instead.
+    # With a limit that is not reached yet, an allocation in flight might fail instead.
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     if not unlimited and os.geteuid() != 0:
         return False

@@ -1,4 +1,4 @@
-"""Geometric paths γ(s): path files, min-snap, polynomial files, random paths at rest at both ends; continued paths."""
+"""Geometric paths γ(s): path files, min-snap, polynomial files, random paths, and continued paths."""
 
 __all__ = [
     "banded",

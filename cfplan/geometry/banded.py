@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 
-REGULARISED, REGULARISED_MOST = 1e-4, 1e14  # added to a diagonal where it must, at first and at most
+REGULARISED, REGULARISED_MOST = 1e-4, 1e14  # added to a diagonal if necessary, first and largest value
 _LEAST_PIVOT = 1e-12  # of matrices whose diagonal is about 1
 
 
@@ -18,7 +18,7 @@ _LEAST_PIVOT = 1e-12  # of matrices whose diagonal is about 1
 def factorise(matrix, added, least=_LEAST_PIVOT):
     """Return the Cholesky factor of the matrix plus `added` on its diagonal, and whether all pivots exceed `least`.
 
-    The diagonal of the factor is inverted. A row of zeros counts as that of the unit matrix.
+    The diagonal of the factor is inverted. A row of zeros is treated as that of the unit matrix.
     """
     size, width = matrix.shape
     factor = np.empty((size, width))
@@ -61,9 +61,9 @@ def solve(factor, right):
 
 @njit(error_model="numpy")
 def solve_regularised(matrix, right, regularised):
-    """Solve with as much added to the diagonal as makes the matrix positive definite; return (solution, added).
+    """Solve with a diagonal term that makes the matrix positive definite; return (solution, term).
 
-    `regularised` is what was added the last time. Where nothing helps the solution is NaN.
+    `regularised` is the term of the last time. If none helps, the solution is NaN.
     """
     added = 0.0
     factor, definite = factorise(matrix, added)
@@ -78,7 +78,7 @@ def solve_regularised(matrix, right, regularised):
 def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
     """Return the solution for right sides, (size, K), of a positive definite matrix, (size, width).
 
-    Raises LinAlgError where the matrix is not positive definite, or so nearly not that rounding decides.
+    Raises LinAlgError unless the matrix is positive definite beyond rounding.
     """
     solution, definite = solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
     if not definite:

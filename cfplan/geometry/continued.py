@@ -1,11 +1,10 @@
 """Continued paths: curves that begin in motion, with given γ to γ'''', and end at rest.
 
-Where a path begins with the derivatives of another at some place, a speed profile continues across that joint by its
-boundary state alone: velocity, acceleration and jerk do not jump, and snap only by what h''' does. So both paths share
-the unit of s there.
+If a path begins with the derivatives of another one at some place, in the same unit of s, a speed profile continues
+across that joint by its boundary state: velocity, acceleration and jerk do not jump, and snap only with h'''.
 
-Pieces of degree 7 can begin with any γ', γ'', γ'''. What is missing of γ'''' is added as a polynomial of degree 9 that
-vanishes with four derivatives where it ends. Its own snap is as large whatever its length, and the curve moves less the
+Pieces of degree 7 can begin with any γ', γ'', γ'''. The missing part of γ'''' is added as a polynomial of degree 9 that
+vanishes at its end with four derivatives. Its snap does not depend on its length, and it moves the curve less the
 shorter it is.
 """
 
@@ -26,7 +25,7 @@ from cfplan.geometry.min_snap import (
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import hermite, padded, shifted
 
-ORDERS = 5  # γ and four derivatives, that a path continues
+ORDERS = 5  # γ and four derivatives
 BLEND = 0.4  # s of nominal time, over which a given γ'''' fades; at most half of the first segment
 _HERMITE = hermite(ORDERS)
 _FACTORIALS = np.array([factorial(order) for order in range(ORDERS)], dtype=float)[:, None]
@@ -36,8 +35,8 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
     """Return the path of least snap that begins with γ to γ'''' as `start`, (5, 3), has them, and ends at rest.
 
     It goes through the waypoints, (K, 3) m, K at least 1; `times`, (K,) s of nominal time, are those of the segments
-    that end in each. Where they are not given, they are centripetal. With the times that are
-    left of another path of least snap through the same waypoints, from a state of that path, it is the rest of it.
+    that end in each, by default centripetal. From a state of another minimum-snap path
+    through the same waypoints, with its remaining times, the result is the rest of that path.
 
     Raises:
         InputError: two points in a row closer than MIN_SPACING, numbers that are not finite, times that are not
@@ -48,14 +47,14 @@ def continued_min_snap(start: ArrayLike, waypoints: ArrayLike, times: ArrayLike 
 
 
 def continued_through(start: NDArray, points: NDArray, times: NDArray) -> Path:
-    """Return the same for a start, points and times of segments, (K,) s, that are checked already."""
+    """Return the same from a start, points and segment times, (K,) s, that have been checked."""
     return _fitted(start, times, pieces_through(points, times, start=start[1:4], rest_end=True))
 
 
 def check_continued(start: ArrayLike, waypoints: ArrayLike) -> tuple[NDArray, NDArray]:
     """Return the start, (5, 3), and the points, (K+1, 3), the first of which is the start's.
 
-    Raises InputError as continued_min_snap() does.
+    Raises InputError like continued_min_snap().
     """
     begin, ahead = np.asarray(start, dtype=float), np.asarray(waypoints, dtype=float)
     if begin.shape != (ORDERS, 3) or not np.isfinite(begin).all():
@@ -85,7 +84,7 @@ def check_continued(start: ArrayLike, waypoints: ArrayLike) -> tuple[NDArray, ND
 
 
 def _fitted(start: NDArray, spans: NDArray, table: NDArray) -> Path:
-    """Return the path of pieces, (M, D, 3) about their left ends, that begin with γ to γ'''; and now with γ'''' too."""
+    """Return the path of pieces, (M, D, 3) about their left ends, with γ'''' at the start added."""
     blend = min(BLEND, spans[0] / 2)
     table = padded(table, max(2 * ORDERS, table.shape[1]))
     table = np.concatenate([table[:1], shifted(table[:1], np.array([blend])), table[1:]])

@@ -18,7 +18,7 @@ from cfplan.geometry.polynomials import hermite
 from cfplan.geometry.rest import rest_path, with_rest_ends
 from cfplan.machine_code import njit
 
-MIN_SPACING = 0.01  # m, two waypoints in a row that are closer are one point mistyped
+MIN_SPACING = 0.01  # m; closer neighbouring waypoints count as one point mistyped
 MIN_DENSE_SPACING = 0.001  # m, the same for lists of points
 REMOVE_HINT = "remove one of them"
 MAX_COORDINATE = 1e5  # m from the origin along each axis: beyond this rounding costs millimetres
@@ -41,7 +41,7 @@ def min_snap(waypoints: ArrayLike, *, nominal_speed: float = 1.0, times: ArrayLi
     """Return the path of least snap through waypoints, (K, 3) m, at rest at both ends.
 
     Each segment takes its straight length over the nominal speed, m/s, so at 1 m/s s is roughly the distance flown, m;
-    or as long as `times`, (K-1,) s, say.
+    or `times`, (K-1,) s, if given.
 
     Raises:
         InputError: fewer than two waypoints, two in a row closer than MIN_SPACING, numbers that are not finite, times
@@ -60,7 +60,7 @@ def least_snap(points: NDArray, times: NDArray) -> Path:
 def centripetal_times(points: ArrayLike) -> NDArray:
     """Return nominal times, (K-1,) s, for segments between points, (K, 3) m: the root of each straight length.
 
-    Where lengths differ much, the curve swings out far less than with times like the lengths, and is flown sooner
+    If lengths differ much, the curve swings out far less than with times in proportion to lengths, and is flown faster
     (centripetal parameterisation, after Lee, "Choosing nodes in parametric curve interpolation", 1989).
     """
     return np.asarray(np.sqrt(np.linalg.norm(np.diff(np.asarray(points, dtype=float), axis=0), axis=1)))
@@ -85,7 +85,7 @@ def spaced(points: NDArray) -> NDArray:
     """Return points, (K, 3) m, without those closer than MIN_SPACING to the last point that is kept."""
     kept: list[NDArray] = []
     for point in points:
-        if not kept or not math.dist(point, kept[-1]) < MIN_SPACING:  # NaN is kept, to be refused
+        if not kept or not math.dist(point, kept[-1]) < MIN_SPACING:  # NaN is kept, to be refused later
             kept.append(point)
     return np.array(kept).reshape(-1, 3)
 
@@ -130,7 +130,7 @@ def check_points(
 
 
 def check_times(points: NDArray, times: ArrayLike) -> NDArray:
-    """Return the nominal times of the segments between points, (K-1,) s. Raises InputError where they are none."""
+    """Return the nominal times of the segments between points, (K-1,) s. Raises InputError if they are invalid."""
     spans = np.asarray(times, dtype=float)
     if spans.shape != (len(points) - 1,) or not (np.isfinite(spans).all() and (spans > 0.0).all()):
         raise InputError(
@@ -155,7 +155,7 @@ def pieces_through(points: NDArray, times: NDArray, start: NDArray | None, rest_
     """Return (K-1, 8, 3), the polynomial of each segment about its left end, with the least snap.
 
     Segment i goes from points[i] to points[i + 1], (K, 3) m, in times[i], s. `start`, (3, 3), is γ', γ'', γ''' at the
-    first point, None where they are free; the end rests or is free.
+    first point, None if they are free; the end rests or is free.
     """
     return np.asarray(_pieces(derivatives_at(points, times, start, rest_end), points, times, HERMITE))
 
@@ -272,6 +272,6 @@ def _pieces(derivatives: NDArray, points: NDArray, times: NDArray, hermite: NDAr
                 for column in range(8):
                     value += hermite[row, column] * ends[column]
                 table[i, row, axis] = value / power
-            # Added last: far from the origin it would cost the short segments their digits.
+            # Added last, as far from the origin it would cost short segments their precision.
             table[i, 0, axis] = points[i, axis]
     return table

@@ -11,8 +11,8 @@ from cfplan.geometry.polynomials import ORDERS, derivatives_on, intervals_of, pa
 from cfplan.machine_code import njit
 from cfplan.numbers import coordinates
 
-STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: where an inner minimum falls below this, the path stops
-_SAMPLES = 32  # per piece, where a path is searched for stops
+STANDSTILL = 0.01  # |γ'|, which is 1 at the nominal 1 m/s: an inner minimum below this is a stop
+_SAMPLES = 32  # per piece, for finding stops
 _ZOOMS = 6  # each to an interval a fifteenth as long
 _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 
@@ -21,15 +21,15 @@ _GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(24)
 class Path:
     """A curve γ(s) for s in [0, end], piecewise polynomial; at least C⁴ if this package made it.
 
-    s is nominal time, s, at about 1 m/s. At a rest end γ' = γ'' = γ''' = 0 exactly. For that the last piece is expanded
+    s is nominal time, s, at about 1 m/s. At a rest end γ' = γ'' = γ''' = 0 exactly. For this the last piece is expanded
     about its right end and every other about its left end, so a path with two rest ends needs two pieces. Outside
-    [0, end] the path stays at its ends.
+    [0, end] the path is constant.
     """
 
     breaks: NDArray  # (M+1,) ascending from 0
     coefficients: NDArray  # (M, D, 3) m, ascending powers of s - breaks[i]; of s - breaks[-1] in the last piece
     origins: NDArray = field(init=False, repr=False)  # (M,) the s about which each piece is expanded
-    _length: float = field(init=False, repr=False, default=math.nan)  # m, once it was asked for
+    _length: float = field(init=False, repr=False, default=math.nan)  # m, cached
 
     def __post_init__(self) -> None:
         breaks = np.array(self.breaks, dtype=float)
@@ -71,7 +71,7 @@ class Path:
 
     @property
     def length(self) -> float:
-        """Return the arc length, m, measured when it is first asked for."""
+        """Return the arc length, m, computed once."""
         if math.isnan(self._length):
             object.__setattr__(self, "_length", float(self.piece_lengths().sum()))
         return self._length
@@ -95,7 +95,7 @@ class Path:
 
     def part(self, low: float, high: float) -> "Path":
         """Return the path from s = low to s = high, in two pieces or more so that rest ends stay exact."""
-        high = min(high, float(self.breaks[-1]))  # it may exceed the end by a rounding error
+        high = min(high, float(self.breaks[-1]))  # it may exceed the end by rounding
         first = int(np.searchsorted(self.breaks, low, side="right")) - 1
         last = int(np.searchsorted(self.breaks, high, side="left"))
         piece = np.arange(first, last)
@@ -110,7 +110,7 @@ class Path:
         """Return this path and then another, in the same unit of s, that begins with the derivatives of its end."""
         count = max(self.coefficients.shape[1], other.coefficients.shape[1])
         before, after = padded(self.coefficients, count), padded(other.coefficients, count)
-        before[-1] = shifted(before[-1:], self.breaks[-2:-1] - self.breaks[-1])[0]  # the last piece no more
+        before[-1] = shifted(before[-1:], self.breaks[-2:-1] - self.breaks[-1])[0]  # no longer the last piece
         return Path(np.append(self.breaks, self.end + other.breaks[1:]), np.concatenate([before, after]))
 
     def placed(self, offset: ArrayLike, yaw: float = 0.0) -> "Path":
@@ -133,7 +133,7 @@ class Path:
         if still.any():
             self._refuse("a piece has no length", float(self.breaks[int(np.argmax(still))]), where)
 
-        # |γ'| falls to 0 at a rest end as well; a stop inside the path lies between two faster places
+        # |γ'| falls to 0 at rest ends too; an inner stop lies between two faster places
         dips = 1 + np.flatnonzero((speed[1:-1] <= speed[:-2]) & (speed[1:-1] <= speed[2:]))
         slowest = self._slowest(s[dips - 1], s[dips + 1])
         stops = slowest[np.linalg.norm(self(slowest, 1), axis=-1) < STANDSTILL]

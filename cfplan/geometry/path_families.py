@@ -1,4 +1,4 @@
-"""Path families: random waypoints of the kinds of paths that people fly, each from a seed."""
+"""Path families: random waypoints of typical kinds of paths, each from a seed."""
 
 import math
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import rotation_about_z
 from cfplan.geometry.random_paths import SPACING, generator, random_waypoints
 
-BOXES = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))  # m, sides of the boxes that half of the random paths are drawn in
+BOXES = ((10.0, 10.0, 10.0), (4.5, 8.0, 2.0))  # m, sides of the boxes for half of the random paths
 WAYPOINTS = (3, 6)  # fewest and most of a random path
 POINTS_A_TURN = 8  # of spirals
 
@@ -22,13 +22,13 @@ class Family(StrEnum):
     RANDOM = "random"  # waypoints uniform in a box, of many sizes
     LINE = "line"  # straight, in any direction
     LEGS = "legs"  # long straights with corners between
-    HAIRPIN = "hairpin"  # to and fro, a little aside each time
+    HAIRPIN = "hairpin"  # back and forth, slightly displaced each time
     SPIRAL = "spiral"  # round, up or down, wider or narrower
     LAPS = "laps"  # a closed loop, several times
-    VERTICAL = "vertical"  # up and down, hardly aside
+    VERTICAL = "vertical"  # up and down, with little sideways motion
 
 
-# The families in the shares in which paths of all kinds are drawn: every other path is of random waypoints.
+# The families with their frequencies: every other path has random waypoints.
 USUAL = (
     Family.RANDOM, Family.LINE, Family.RANDOM, Family.LEGS, Family.RANDOM, Family.HAIRPIN,
     Family.RANDOM, Family.SPIRAL, Family.RANDOM, Family.LAPS, Family.RANDOM, Family.VERTICAL,
@@ -36,7 +36,7 @@ USUAL = (
 
 
 def family_waypoints(family: Family, seed: int | np.random.SeedSequence) -> NDArray:
-    """Return waypoints of a family, (K, 3) m, that a seed decides, turned about z by a random angle."""
+    """Return waypoints of a family, (K, 3) m, from a seed, turned about z by a random angle."""
     random = generator(seed)
     points = _DRAW[family](random)
     return np.asarray(points @ rotation_about_z(random.uniform(-math.pi, math.pi)).T)
@@ -105,7 +105,7 @@ def _laps(random: np.random.Generator) -> NDArray:
 
 def _vertical(random: np.random.Generator) -> NDArray:
     count, height = int(random.integers(2, 4, endpoint=True)), _logarithmic(random, 0.3, 8.0)
-    aside = 0.0 if count == 2 else 0.2 * height  # without it the path would reverse
+    aside = 0.0 if count == 2 else 0.2 * height  # else the path would reverse
     points = np.zeros((count, 3))
     points[:, 2] = height * (np.arange(count) % 2) * random.uniform(0.5, 1.0, count)
     points[:, :2] = aside * random.normal(size=(count, 2))

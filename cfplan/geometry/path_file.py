@@ -52,24 +52,24 @@ from cfplan.geometry.waypoints import Gate, Region, Within
 from cfplan.geometry.yaw import YawMode
 
 _LEAST_SAMPLED = 4  # points that a smooth path with free ends needs
-_MANY_WAYPOINTS = 50  # rows of `points`: more are rather samples of a curve
+_MANY_WAYPOINTS = 50  # rows of `points`; more are probably samples of a curve
 _MAX_POINTS = 50_000  # over all laps
 MOST_WITHIN = 100.0  # m, of a region, a gate or a corridor
 _POINTS_HINT = "give x, y, z in metres, as [[0, 0, 1], [1, 0, 1]]"
 
 
 class PathShape(StrEnum):
-    """Which curve leads through waypoints."""
+    """The kind of curve through waypoints."""
 
-    FASTEST = "fastest"  # the one that is flown soonest, see planning/path/choice.py
-    MIN_SNAP = "min-snap"  # the one of least snap for given times of the segments
+    FASTEST = "fastest"  # the shortest flight time, see planning/path/choice.py
+    MIN_SNAP = "min-snap"  # minimum snap for given segment times
 
 
 class SegmentTimes(StrEnum):
     """Times of the segments of a path of least snap."""
 
-    CENTRIPETAL = "centripetal"  # like the roots of the straight lengths
-    LENGTH = "length"  # like the straight lengths
+    CENTRIPETAL = "centripetal"  # in proportion to the roots of straight lengths
+    LENGTH = "length"  # in proportion to straight lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,9 +84,9 @@ class PathFile:
     laps: int
     waypoints: NDArray  # (K, 3) m, in the frame of the room, all laps
     source: pathlib.Path
-    losses: tuple[str, ...] = ()  # what the path does not keep or mistakes in what was given, a few words each
-    shape: PathShape | None = None  # of the path through waypoints; None where the path was given
-    regions: tuple[Region, ...] = ()  # where each waypoint may be passed, all laps; empty where the path was given
+    losses: tuple[str, ...] = ()  # what was lost from the source, a few words each
+    shape: PathShape | None = None  # of the path through waypoints; None for a given curve
+    regions: tuple[Region, ...] = ()  # where each waypoint may be passed, all laps; empty for a given curve
     corridor: float | None = None  # m, how far the path may lead from the straight lines between waypoints
 
     def placed(self, offset: ArrayLike, turn: float) -> "PathFile":
@@ -209,7 +209,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
     """Read a path.yaml, and check that its path can be flown without a stop.
 
     Raises:
-        InputError: a mistake in it or in the file that it names; names line and column.
+        InputError: a mistake in it or in the file that it names; with line and column.
     """
     file = pathlib.Path(file)
     content, places = read_yaml_with_places(file, _Content, lambda data: _of_one_vehicle(data, file))
@@ -243,7 +243,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
 
 
 def _of_one_vehicle(data: dict[str, Any], file: pathlib.Path) -> dict[str, Any]:
-    """Return the data, or raise InputError where they are those of a fleet file."""
+    """Return the data, or raise InputError for a fleet file."""
     if "vehicles" in data:
         raise InputError(
             "a fleet file, where the path of one vehicle is needed",
@@ -356,7 +356,7 @@ def _from_waypoints(content: _Content, places: Places) -> tuple[Path, NDArray]:
 
 
 def _from_points(content: _Content, places: Places) -> tuple[Any, ...]:
-    """Return path and waypoints, and a word if these are rather samples of a curve."""
+    """Return path and waypoints, and a note if these are probably samples of a curve."""
     rows, left_out = _read_points(places, content.points, MIN_SPACING)
     points = _repeated(rows, content.laps, places)
     words = (f"{len(rows)} rows are waypoints here: write `curve: {content.points}` if they are samples of a curve",)
@@ -390,7 +390,7 @@ def _nominal(points: NDArray) -> NDArray:
 
 
 def _read_points(places: Places, name: str | None, spacing: float) -> tuple[NDArray, tuple[str, ...]]:
-    """Return two points or more, (K, 3) m, `spacing`, m, apart or more, from a file beside; and what it leaves out."""
+    """Return two points or more, (K, 3) m, `spacing`, m, apart or more, from a file; and what it leaves out."""
     file = _beside(places, name)
     what = "x, y, z; write `samples:` for rows of t, x, y, z"
     points, lines, others = read_named_table(file, ("x", "y", "z"), what)
@@ -438,7 +438,7 @@ _SOURCES: dict[str, Callable[[_Content, Places], tuple[Any, ...]]] = {
 
 
 def _path_with(through: Callable[[NDArray], Path], points: NDArray, where: str) -> Path:
-    """Return the path through points. Raises InputError that names `where` too if no smooth path joins them."""
+    """Return the path through points. Raises InputError, with `where`, if no smooth path joins them."""
     try:
         return through(points)
     except InputError as error:

@@ -19,9 +19,9 @@ _COLUMNS = 1 + 4 * 8
 _MIN_DURATION = 0.001  # s
 _POSITION_STEP = 0.001  # m allowed between pieces
 _SPACING = 0.04  # m between samples of a curve whose snap jumps
-_TIMES = 50  # moments of a piece, between which its samples are placed
+_TIMES = 50  # moments per piece, between which samples are placed
 _MOST_SAMPLES = 50_000
-_DERIVATIVE_STEP = 0.02  # allowed between pieces, of the largest derivative along any of them: covers six decimals
+_DERIVATIVE_STEP = 0.02  # tolerance between pieces, of the largest derivative: covers six decimals
 _HEADER = ["duration", *(f"{axis}^{power}" for axis in ("x", "y", "z", "yaw") for power in range(8))]
 _NAMES = ("position", "velocity", "acceleration", "jerk", "snap")
 _UNITS = ("m", "m/s", "m/s²", "m/s³", "m/s⁴")
@@ -74,7 +74,7 @@ def _sampled(durations: NDArray, table: NDArray) -> NDArray:
 
 
 def polynomial_rows(durations: NDArray, coefficients: NDArray) -> str:
-    """Return a polynomial file's text for pieces (K,) s and (K, 4, 8): with digits enough for every float32."""
+    """Return a polynomial file's text for pieces (K,) s and (K, 4, 8): with enough digits for float32."""
     rows = np.column_stack([durations, coefficients.reshape(len(durations), -1)])
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows.tolist()]
     return "\n".join([",".join(_HEADER), *lines]) + "\n"
@@ -87,7 +87,7 @@ def read_polynomial_rows(file: pathlib.Path) -> tuple[NDArray, NDArray]:
 
 
 def _check_pieces(file: pathlib.Path, lines: list[int], durations: NDArray, table: NDArray) -> int:
-    """Return at how many joints snap jumps. Raises InputError where a lower derivative does, or a piece is short."""
+    """Return at how many joints snap jumps. Raises InputError if a lower derivative jumps, or a piece is too short."""
     left, right = end_values(durations, table)
     extent = np.abs(table[:, 1:] * durations[:, None, None] ** np.arange(1, 8)[:, None]).sum(axis=1).max(axis=1)
     if (extent < _POSITION_STEP).any():

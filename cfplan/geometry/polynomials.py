@@ -11,16 +11,16 @@ from cfplan.machine_code import njit
 
 ORDERS = 5  # a value and four derivatives
 _SAMPLES = 17  # along a piece, to find its largest derivatives
-_LANES = 64  # points taken together
+_LANES = 64  # points processed together
 _FACTORIALS = (1.0, 1.0, 2.0, 6.0, 24.0)
 _Derivatives = tuple[float, float, float, float, float]
 
 
 @njit
 def intervals_of(edges: NDArray, values: NDArray) -> NDArray:
-    """Return the interval of ascending edges, (M+1,), in which each value, (N,), lies; fast where they are in order.
+    """Return the interval of ascending edges, (M+1,), in which each value, (N,), lies; fast for sorted values.
 
-    An edge belongs to the interval on its right; the first and the last interval hold what lies beyond.
+    An edge belongs to the interval on its right; values beyond the ends belong to the first and the last interval.
     """
     found, k = np.empty(len(values), np.int64), 0
     for n in range(len(values)):
@@ -34,8 +34,8 @@ def intervals_of(edges: NDArray, values: NDArray) -> NDArray:
 def derivatives_on(origins: NDArray, table: NDArray, x: NDArray, piece: NDArray) -> NDArray:
     """Return polynomials, (M, D, A), and four derivatives, (5, A, N), at x, (N,), by that of a piece for each, (N,).
 
-    Piece i is in powers of x - origins[i]. Consecutive points of one piece are taken together, up to _LANES of them, in
-    rows of an array whose size the compiler knows: so it works on several points with one instruction.
+    Piece i is in powers of x - origins[i]. Up to _LANES consecutive points of one piece are processed together, in rows
+    of an array whose size the compiler knows, so that it vectorises.
     """
     axes, begin = table.shape[2], 0
     out, rows = np.empty((ORDERS, axes, len(x))), np.empty((ORDERS + 1, _LANES))
@@ -61,7 +61,7 @@ def _horner(rows: NDArray, coefficients: NDArray, count: int) -> None:
     for order in range(ORDERS):
         for n in range(count):
             rows[order, n] = 0.0
-    for k in range((len(coefficients) - 1) // 4 * 4, -1, -4):  # four coefficients at a time, which spares memory
+    for k in range((len(coefficients) - 1) // 4 * 4, -1, -4):  # four coefficients at a time, for less memory traffic
         a, b = coefficients[k], _or_zero(coefficients, k + 1)
         c, d = _or_zero(coefficients, k + 2), _or_zero(coefficients, k + 3)
         for n in range(count):

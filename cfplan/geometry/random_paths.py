@@ -70,7 +70,7 @@ def random_waypoints(
 def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) -> Path:
     """Return a perturbation of γ from the family π_ε(γ): piecewise polynomial, C⁴, within ε, m, of γ at every s.
 
-    (The paper's "Robustness against Perturbations" asks this at the nodes; here it holds between them as well.)
+    (The paper's "Robustness against Perturbations" requires this at the nodes; here it holds between them too.)
     The perturbation is a quintic B-spline whose control points are uniform in a ball of radius ε. A B-spline lies in
     the convex hull of its control points, which gives the bound. Three control points at each end equal a fourth, so
     a rest end stays at rest.
@@ -84,7 +84,7 @@ def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) ->
     control = _in_ball(generator(seed), spans + _DEGREE, epsilon)
     control[:3], control[-3:] = control[3], control[-4]
     breaks, table = _sum(path, knots, _spline_pieces(knots, control))
-    for end in (0, -1):  # rounding must not move an end that rests
+    for end in (0, -1):  # rounding must not move a rest end
         table[end, 1:4] = path.coefficients[end, 1:4]
     return Path(breaks, table)
 
@@ -92,7 +92,7 @@ def perturbed(path: Path, epsilon: float, seed: int | np.random.SeedSequence) ->
 def _sum(path: Path, knots: NDArray, pieces: NDArray) -> tuple[NDArray, NDArray]:
     """Return breaks and coefficients of γ plus pieces (M, D, 3), each about its left knot, on the same range of s."""
     breaks = np.union1d(path.breaks, knots)
-    breaks = breaks[np.diff(breaks, append=np.inf) > 1e-9 * path.end]  # a knot may be a break but for rounding
+    breaks = breaks[np.diff(breaks, append=np.inf) > 1e-9 * path.end]  # a knot may equal a break up to rounding
     origins = breaks[:-1].copy()
     origins[-1] = path.end
 

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from cfplan.geometry.path import Path
 from cfplan.geometry.polynomials import composed, end_values, hermite, largest_values, padded, reversed_pieces, shifted
 
-WARP = 1.5  # s of nominal time in which speed is gathered; at most half of the path
+WARP = 1.5  # s of nominal time to accelerate; at most half of the path
 _WARP_PIECES = 16
 _TERMS = 16  # Taylor terms kept of the composition
-_NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])  # γ', γ'', γ''' at 1 m/s: an end that moves less is at rest but for rounding
-_ROUNDED = np.array([1e-3, 3e-3, 1e-2])  # the same, of the largest along the piece: six decimals of a slow file
+_NEGLIGIBLE = np.array([1e-3, 1e-2, 1e-1])  # γ', γ'', γ''' at 1 m/s; below this an end counts as at rest
+_ROUNDED = np.array(
+    [1e-3, 3e-3, 1e-2]
+)  # the same, relative to the largest along the piece: six decimals of a slow file
 _HERMITE = hermite(5)
 
 
@@ -32,7 +34,7 @@ def with_rest_ends(durations: NDArray, table: NDArray) -> Path:
     """
     durations, table = _at_nominal_speed(durations, table)
     half = durations.sum() / 2
-    for _ in range(2):  # the start, then the end as the start of the way back
+    for _ in range(2):  # the start, then the end as the start of the reversed path
         durations, table = _with_rest_start(durations, table, half)
         durations, table = reversed_pieces(durations, table)
     return rest_path(durations, table)
@@ -130,7 +132,7 @@ def _warp_grid(sigma: NDArray, breaks: NDArray) -> NDArray:
     joints = _inverse(sigma, breaks[(breaks > 0.0) & (breaks < reach * (1 - 1e-9))])
     if not len(joints):
         return u
-    apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES  # far shorter pieces would lose digits
+    apart = np.abs(u[:, None] - joints).min(axis=1) > 0.25 / _WARP_PIECES  # much shorter pieces would lose digits
     apart[[0, -1]] = True
     return np.sort(np.concatenate([u[apart], joints]))
 

@@ -1,7 +1,7 @@
 """Samples of a motion with times, from Blender, a vehicle carried by hand or a motion capture log, as points of a path.
 
-The planner times a path, so only the way is kept. Samples lie as close as they were taken, noise and all, and where the
-motion rested they lie on a heap; so the way is cut into steps of equal length and the samples of each are averaged.
+The planner times a path, so only the curve is kept. Samples are as dense and noisy as they were measured, and pile up
+where the motion rested; so the curve is cut into steps of equal length, and the samples of each are averaged.
 """
 
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.geometry.path import Path
 
-STEP = 0.08  # m along the way between points, and over which samples are averaged: bends of 0.5 m keep within 2 mm
-_MIN_POINTS = 24  # points of a way that is too short for so many steps
-_MIN_STEP_FRACTION = 0.25  # of a step: samples nearer than that to the last one that counted do not count as way
-_MAX_SPEED = 30.0  # m/s between two samples: faster is another marker, or another unit
-_REST_SPEED = 0.03  # m/s, slower than which it rests
+STEP = 0.08  # m between points, and averaging length: bends of 0.5 m change by at most 2 mm
+_MIN_POINTS = 24  # points of a curve that is too short for this many steps
+_MIN_STEP_FRACTION = 0.25  # of a step; samples closer to the last counted one add no length
+_MAX_SPEED = 30.0  # m/s between samples; a faster one is another marker, or in another unit
+_REST_SPEED = 0.03  # m/s, largest speed at rest
 _SHORTEST_REST = 0.3  # s
-_MIN_REST_SAMPLES = 10  # samples of which a mean is better than the first
-_LONGEST_GAP = 0.5  # s without samples that need not be told
+_MIN_REST_SAMPLES = 10  # samples for which the mean is better than the first
+_LONGEST_GAP = 0.5  # s, longest gap that is not reported
 
 
 @dataclass(frozen=True, slots=True)
 class TimedSamples:
-    """A motion as it was taken."""
+    """A measured motion."""
 
     time: NDArray  # (N,) s, rising
     position: NDArray  # (N, 3) m
@@ -53,13 +53,13 @@ class TimedSamples:
         return points[keep]
 
     def _end(self, which: NDArray, index: int) -> NDArray:
-        """Return where the motion begins or ends, (3,) m: the mean of a rest, as noise averages out of that."""
+        """Return where the motion begins or ends, (3,) m: the mean of a rest, which averages noise out."""
         place = self.position[which]
         rests = len(place) > _MIN_REST_SAMPLES and float(np.ptp(place, axis=0).max()) < STEP / 4
         return np.asarray(place.mean(axis=0) if rests else self.position[index])
 
     def losses(self, path: Path) -> tuple[str, ...]:
-        """Return what the path does not keep of the motion, a few words each."""
+        """Return what the path loses of the motion, a few words each."""
         found = [f"timing is not kept: {self.time[-1] - self.time[0]:.1f} s of {len(self.time)} samples"]
         rests = self._rests()
         if rests:
@@ -74,7 +74,7 @@ class TimedSamples:
         return tuple(found)
 
     def _rests(self) -> list[float]:
-        """Return how long the motion rests, s, each time; at its ends too."""
+        """Return the durations, s, of rests, also at the ends."""
         if len(self.time) < 3:
             return []
         window = max(1, int(np.searchsorted(self.time - self.time[0], _SHORTEST_REST)))
@@ -91,7 +91,7 @@ class TimedSamples:
 def timed_samples(rows: NDArray, lines: list[int], file: str) -> TimedSamples:
     """Return rows of t, x, y, z, (N, 4), as a motion.
 
-    Raises InputError with the line where time does not rise, or the motion jumps; and where there is none.
+    Raises InputError with the line if time does not rise or the motion jumps, or if there is no motion.
     """
     time, position = rows[:, 0], rows[:, 1:]
     if len(rows) < 2:
@@ -129,7 +129,7 @@ def distances(path: Path, position: NDArray) -> NDArray:
 
 
 def _thinned(position: NDArray, least: float) -> NDArray:
-    """Return the indices of samples each at least so far, m, from the one before in the chain; and of the last."""
+    """Return the indices of samples that are each at least `least`, m, from the one before; and of the last."""
     chosen, here = [0], position[0]
     for index in range(1, len(position)):
         distance = position[index] - here

@@ -1,7 +1,7 @@
-"""Advice after a flight: whether its deviation grows with speed, as a vehicle's does that is not as its file says.
+"""Advice after a flight: a deviation that grows with speed shows that the vehicle differs from its airframe file.
 
-Latency and drag that a lab does not know of move a vehicle along its motion, in proportion to its speed; noise and
-gusts do so to no side.
+Unknown latency and drag displace a vehicle along its motion, in proportion to its speed; noise and gusts have no
+preferred direction.
 """
 
 import numpy as np
@@ -12,14 +12,14 @@ from cfplan.recording.summary import reference_span, reference_times
 # m of deviation along the motion per m/s. In the virtual lab known vehicles have 4 to 13 mm, those with drag and
 # latency off by half some 20; the rest of an unknown vehicle's deviation does not grow with speed.
 _MAX_DEVIATION_PER_SPEED = 0.015
-_MIN_TOP_SPEED = 0.5  # m/s, that the flight must reach to tell
+_MIN_TOP_SPEED = 0.5  # m/s, least top speed of the flight for this test
 _MIN_POSES = 100  # poses
 
 
 def deviation_per_speed(record: Record) -> float:
     """Return m of horizontal deviation along the motion per m/s of the reference's speed; NaN where not known.
 
-    Positive is ahead. What is proportional to the acceleration or constant is fitted beside it, and left out.
+    Positive is ahead. A constant and a part proportional to acceleration are fitted too, and discarded.
     """
     begin, end = reference_span(record)
     time = record.poses.time
@@ -41,5 +41,5 @@ def deviation_per_speed(record: Record) -> float:
 
 
 def suggests_identification(record: Record) -> bool:
-    """Return whether the flight's deviation grows with speed by more than a vehicle's that is known."""
+    """Return whether the flight's deviation grows with speed by more than that of a known vehicle."""
     return abs(deviation_per_speed(record)) > _MAX_DEVIATION_PER_SPEED

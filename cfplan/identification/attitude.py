@@ -23,7 +23,7 @@ from cfplan.vehicle.rotations import product
 STEP = 0.001  # s, of the grid on which everything is integrated
 _MARGIN = 0.2  # s of the grid before and behind the flight
 _SPAN = 12  # poses over which turns are compared: 0.12 s at 100 Hz
-# rad rms over such a span, from which turns are told from noise; share of it by which poses may turn otherwise
+# rad rms over such a span, least turn that exceeds noise; largest misfit of the poses, as a fraction of it
 _MIN_TURN, _MAX_TURN_MISFIT = 0.02, 0.6
 _MIN_INFORMATION, _REGULARISATION = 1e-6, 1e-9
 _SMOOTHING = 0.25  # s, by which the slow difference of poses and gyroscope is smoothed

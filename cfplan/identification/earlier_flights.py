@@ -1,9 +1,9 @@
-"""Earlier flights of a plan: what the vehicle strayed by in them, and the correction that takes back what repeats.
+"""Earlier flights of a plan: their deviations, and the correction of the part that repeats.
 
-A trajectory that is shifted, with all that follows from it, moves the vehicle by just that shift: in the dry run to
-within a tenth for all that changes in 0.5 s or more. So where a vehicle was, less what it was asked for, is what it
-strays by, corrected or not, and the best correction is the mean of that over all flights, taken back. What does not
-repeat averages out, and one flight more changes the correction less and less.
+Shifting a trajectory moves the vehicle by the same shift: in the dry run to within a tenth, for changes over 0.5 s or
+more. So the deviation from the commanded trajectory is the same with a correction as without, and the best correction
+is the negative mean deviation over all flights. Deviations that do not repeat average out, and each further flight
+changes the correction less.
 """
 
 from collections.abc import Sequence
@@ -26,15 +26,13 @@ from cfplan.safety.limits import Limits
 from cfplan.vehicle.correction import PlanCorrection, fit_correction
 from cfplan.vehicle.trajectory import Trajectory
 
-SPACING = (
-    0.25  # s between knots of a correction; faster than 2 Hz nothing is learned (docs/flying.md has what that buys)
-)
-LARGEST = 0.2  # m, a vehicle that strays farther is not what its airframe says
-# s of hover after the end that count as the flight does, about as long as the pilot holds it. The shift at the end is
-# held there too, while a vehicle that lagged by 4 cm comes up within half a second and would be off by all of it.
-HOVER = 1.5
-_ENOUGH = 3  # flights that tell what repeats from what does not
-_CHANCE = 2.0  # times the variance that chance explains: more than that repeats
+SPACING = 0.25  # s between knots of a correction, which has a bandwidth of 2 Hz (see docs/flying.md)
+LARGEST = 0.2  # m; a vehicle with a larger deviation does not match its airframe
+# s of hover after the end that count as flight, about as long as the pilot holds it. The shift at the end also applies
+# there, while a vehicle that lagged by 4 cm arrives within half a second and would be displaced by all of it.
+HOVER = 1.25
+_ENOUGH = 3  # flights needed to separate repeated deviation from chance
+_CHANCE = 2.0  # times the variance expected by chance; a larger one repeats
 _FLOWN_HINT = "name records of flights that flew the whole plan and landed"
 
 
@@ -43,22 +41,22 @@ class EarlierFlight:
     """One flight of a plan."""
 
     where: str  # its record, for errors
-    planned: Trajectory  # where the vehicle was wanted
-    asked: Trajectory  # what it was asked to fly: the same, or corrected; by the same s
+    planned: Trajectory  # the plan without correction
+    asked: Trajectory  # the commanded trajectory, with or without correction; with the same s
     times: NDArray  # (N,) s from the start, ascending, to HOVER after the end
-    position: NDArray  # (N, 3) m, where it was
+    position: NDArray  # (N, 3) m, measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learned:
-    """What earlier flights of a plan teach."""
+    """The result of learning from earlier flights of a plan."""
 
     correction: PlanCorrection
-    shift: float  # m, the largest of it
+    shift: float  # m, its largest value
     before: float  # m, largest distance from the plan in the last flight
-    expected: float  # m, the same with the correction, the mean over the flights had they flown with it
-    unrepeated: float  # m rms, by which a flight differs from the others; NaN of one flight
-    exhausted: bool  # whether what the last flight strayed by does not repeat
+    expected: float  # m, the same with the correction, mean over the flights
+    unrepeated: float  # m rms, difference of a flight from the others; NaN for one flight
+    exhausted: bool  # whether the deviation of the last flight does not repeat
 
     def describe(self) -> str:
         """Return it in one line."""
@@ -97,15 +95,15 @@ def learn_correction(flights: Sequence[EarlierFlight]) -> Learned:
 
 
 class _Strayed(NamedTuple):
-    """How a vehicle strayed in one flight."""
+    """The deviation of a vehicle in one flight."""
 
     time: NDArray  # (N,) s, when the plan is where the vehicle was wanted
-    off: NDArray  # (N, 3) m, from what it was asked to fly
-    shift: NDArray  # (N, 3) m, of that from the plan
+    off: NDArray  # (N, 3) m, from the commanded trajectory
+    shift: NDArray  # (N, 3) m, of the commanded trajectory from the plan
 
 
 def _strayed(flight: EarlierFlight) -> _Strayed:
-    """Return how the vehicle strayed. Raises InputError as learn_correction()."""
+    """Return the deviation of a flight. Raises InputError like learn_correction()."""
     end = flight.asked.duration + HOVER
     known = np.isfinite(flight.position).all(axis=1) & (flight.times >= 0.0) & (flight.times <= end)
     times = flight.times[known]
@@ -139,12 +137,12 @@ def _rms(off: NDArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarlierFlights:
-    """Records of flights of one plan that may be flown again."""
+    """Records of flights of one plan, which can be flown again."""
 
     name: str
-    plan_file: Path  # of the plan, as it was before any correction
+    plan_file: Path  # file of the uncorrected plan
     flights: tuple[EarlierFlight, ...]
-    uri: str  # of the vehicle that flew the last
+    uri: str  # of the vehicle in the last flight
 
 
 def earlier_flights(folders: Sequence[Path], path_or_plan: Path, limits: Limits, *, on_board: bool) -> EarlierFlights:
@@ -165,7 +163,7 @@ def earlier_flights(folders: Sequence[Path], path_or_plan: Path, limits: Limits,
 
 
 def _read(folder: Path, limits: Limits, on_board: bool) -> tuple[Record, Path, Plan, EarlierFlight]:
-    """Return a record, the file of its plan before any correction, that plan, and the flight."""
+    """Return a record, the file of its uncorrected plan, that plan, and the flight."""
     record = read_record(folder)
     where = str(record.folder)
     if len(record.commitments.time):
@@ -191,7 +189,7 @@ def _read(folder: Path, limits: Limits, on_board: bool) -> tuple[Record, Path, P
 
 
 def _check_limits(then: Limits, now: Limits, where: str) -> None:
-    """Raise InputError where what a plan depends on has changed."""
+    """Raise InputError if limits or vehicle of a plan have changed."""
     for what, before, today in (
         ("the airframe", then.airframe, now.airframe),
         ("the limits of plans", then.plan, now.plan),
@@ -205,7 +203,7 @@ def _check_limits(then: Limits, now: Limits, where: str) -> None:
 
 
 def _check_source(path_or_plan: Path, record: Record, file: Path, plan: Plan) -> None:
-    """Raise InputError where the path file or plan file is not what was flown."""
+    """Raise InputError if the path file or plan file is not the one that was flown."""
     if path_or_plan.suffix == file.suffix:
         same = _same_motion(load_plan(path_or_plan), plan)
     else:

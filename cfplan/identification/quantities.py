@@ -1,4 +1,4 @@
-"""Quantities: the identified figures with their units and uncertainties, and what the records cannot tell."""
+"""Identified quantities with units and uncertainties, and what the records cannot determine."""
 
 import math
 from collections.abc import Sequence
@@ -31,11 +31,11 @@ _THRUST_STD = 1.2e-3
 _SOURCE = "identified from flights by cfplan identify; the rest: "
 # s: the quickest message of the log takes one, and its gyroscope's sample is as old; known to one.
 _LOG_DELAY, _LOG_DELAY_STD = 2e-3, 1e-3
-_PLAUSIBLE_RATIO = (0.5, 2.0)  # thrust over mass, of before: no vehicle that flew as believed is farther off
+_PLAUSIBLE_RATIO = (0.5, 2.0)  # plausible range of thrust over mass, relative to the airframe
 _SIGNIFICANT_DEVIATIONS = 2.0  # standard uncertainties
 _LARGE_MISFIT = 0.004  # m rms
-_MAX_DRAG_STD, _MAX_LAG_STD = 0.3, 0.02  # share of the value, s: larger uncertainties tell nothing
-_MIN_VOLTAGE_SPAN = 0.3  # V that the voltage must span
+_MAX_DRAG_STD, _MAX_LAG_STD = 0.3, 0.02  # share of the value, s: larger uncertainties count as unobservable
+_MIN_VOLTAGE_SPAN = 0.3  # V, least range of the voltage
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,12 @@ class IdentifiedQuantity:
 
     name: str
     value: float
-    deviation: float  # standard uncertainty; NaN where the records say nothing
+    deviation: float  # standard uncertainty; NaN if the records do not determine it
     unit: str
-    before: float  # what the airframe or safety.yaml said; NaN where nothing did
+    before: float  # value in the airframe or safety.yaml; NaN if there was none
     digits: int
-    unobservable_reason: str = ""  # why the records cannot tell; empty where they can
-    remark: str = ""  # what else to know
+    unobservable_reason: str = ""  # why the records cannot determine it; empty if they can
+    remark: str = ""  # further remark
     scale: float = 1.0  # from SI to the unit
 
     def row(self) -> list[str]:
@@ -73,13 +73,13 @@ class IdentifiedQuantity:
 
 @dataclass(frozen=True, slots=True)
 class Identification:
-    """What the records say of one vehicle."""
+    """The identification of one vehicle."""
 
-    airframe: Airframe  # with what was told; the rest as before
+    airframe: Airframe  # with the identified values, otherwise as before
     pose_latency: float  # s, from exposure to the pilot: `pose.latency` of safety.yaml
-    poses_misdated: bool  # whether poses are dated otherwise than they should be, beyond doubt
+    poses_misdated: bool  # whether the pose latency differs significantly from the one in use
     quantities: dict[str, IdentifiedQuantity]
-    notes: tuple[str, ...]  # what no record can tell, and what was held
+    notes: tuple[str, ...]  # remarks on what is not observable, and what was held fixed
     misfit: float  # m rms, of predictions over a second
 
     def to_dict(self) -> dict[str, Any]:
@@ -91,7 +91,7 @@ class Identification:
 def assemble(
     models: Sequence[FlightModel], solution: FittedUnknowns, *, mass: float | None, voltage: float
 ) -> Identification:
-    """Return the figures of a fit, and the airframe with those that the records tell."""
+    """Return the figures of a fit, and the airframe with those that are observable."""
     before = models[0].signals.airframe
     ratio = float(np.linalg.norm(solution.linear[THRUST])) * before.mass / _full_thrust(before)
     if not _PLAUSIBLE_RATIO[0] <= ratio <= _PLAUSIBLE_RATIO[1]:

@@ -1,4 +1,4 @@
-"""Which limit holds a plan back, and where; and the colour of each limit, wherever it is drawn."""
+"""Active limits: which limit holds a plan back, and where; and the colour of each limit in drawings."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from cfplan.planning.plan_result import Plan
 from cfplan.safety.certificate import shares
 
-ACTIVE = 0.95  # share from which a limit counts as what holds the plan back
+ACTIVE = 0.95  # usage from which a limit counts as active
 STEP = 0.01  # s, between the samples of the plan
-LIGHTEST = 0.55  # of a colour's luminance on white paper; lighter ones are darkened to it
+LIGHTEST = 0.55  # largest luminance of a colour on white paper; lighter ones are darkened
 
 Colour = tuple[int, int, int]
 FREE, FREE_COLOUR = "none", (60, 66, 76)
@@ -33,11 +33,11 @@ class ActiveLimits:
 
     time: NDArray  # (N,) s from the start of the path
     position: NDArray  # (N, 3) m
-    name: NDArray  # (N,) str: the limit that is used most, where that is at least ACTIVE of it, else FREE
+    name: NDArray  # (N,) str: the limit with the largest usage if that is at least ACTIVE, else FREE
     shares: dict[str, NDArray]  # (N,) of each limit, 1 at the limit
 
     def stretches(self) -> list[tuple[str, slice]]:
-        """Return each run of samples with one name, in order; neighbours share a sample, so that lines meet."""
+        """Return each run of samples with the same name, in order; neighbours share a sample, so that lines meet."""
         edges = [0, *(np.flatnonzero(self.name[1:] != self.name[:-1]) + 1), len(self.name)]
         return [
             (str(self.name[begin]), slice(int(begin), min(int(end) + 1, len(self.name))))
@@ -46,7 +46,7 @@ class ActiveLimits:
 
 
 def on_white(colour: Colour) -> str:
-    """Return the colour for white paper as #rrggbb, darkened where it is too light."""
+    """Return the colour for white paper as #rrggbb, darkened if it is too light."""
     red, green, blue = colour
     luminance = (0.2126 * red + 0.7152 * green + 0.0722 * blue) / 255
     factor = min(1.0, LIGHTEST / luminance) if luminance > 0 else 1.0

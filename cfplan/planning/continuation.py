@@ -5,7 +5,7 @@ The new plan takes over at a joint, a moment of the previous trajectory:
     before the joint   the previous trajectory is flown, unchanged
     at the joint       the new path has γ to γ'''' of the previous motion, and its profile begins with h, h', h'', ψ and
                        ψ', so attitude and body rates do not jump (vehicle/joint.py)
-    behind the joint   the new path leads through the waypoints to rest; it is chosen within milliseconds
+    after the joint    the new path leads through the waypoints to rest; it is chosen within milliseconds
                        (path/onward.py), and planned and certified like a plan before take-off
 
 For a vehicle at rest there is no joint: the path begins at its hover, and the search may take longer. A joint is a
@@ -46,8 +46,8 @@ from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
 SLOWING, LEVEL_FOR = 1.5, 0.3  # m/s², deceleration to a lower speed limit, and s before it begins
-STOPPING = 0.6  # s of the previous path, within which a vehicle that stops comes to rest
-OVERSHOOT = 0.2  # s, for which a vehicle that speeds up continues to do so
+STOPPING = 0.6  # s of the previous path, within which a stopping vehicle comes to rest
+OVERSHOOT = 0.2  # s for which an accelerating vehicle continues to accelerate
 ROOM = 0.005  # fraction of each limit that plans leave to the plan that continues them
 ROOM_BETWEEN_POINTS = 0.6  # fraction of ROOM that may be exceeded between points, which saves rounds of tightening
 SEARCH_TIMEOUT = 2.0  # s, for a vehicle at rest
@@ -57,7 +57,7 @@ INTERVALS_FACTOR = 0.85  # of the usual number: flights take 0.05 % longer, and 
 
 
 class NoWayError(InfeasibleError):
-    """No path that was tried leads from the state at a joint through the waypoints; one from a later joint may."""
+    """Raised when no path was found from the state at a joint; a later joint may have one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def continue_plan(
     leave: float,
     waypoints: ArrayLike,
     limits: Limits,
-    *,  # options, each of which is used without the others
+    *,  # independent options
     reached: ArrayLike = (),
     yaw: YawMode = YawMode.FIXED,
     yaw_angle: float = 0.0,
@@ -82,13 +82,13 @@ def continue_plan(
 ) -> Continuation:
     """Return a certified plan that leaves a trajectory at `leave`, s, and goes through waypoints, (K, 3) m, to rest.
 
-    The first J waypoints may be those of the previous path, at s = `reached`, (J,), on it: then the search also begins
-    from the rest of that path. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is a limit
-    that holds once the vehicle has gently slowed down to it. With `leave_room` the plan keeps a fraction ROOM below
-    limits, so that it can be continued; a state at a limit may only have continuations without room.
+    The first J waypoints may be those of the previous path, at s = `reached`, (J,), on it: then the search also starts
+    from the remainder of that path. In mode FIXED yaw turns to `yaw_angle`, rad, along the path. `speed`, m/s, is a
+    limit that holds once the vehicle has gently slowed down to it. With `leave_room` the plan keeps a fraction ROOM
+    below limits, so that it can be continued; a state at a limit may only have continuations without room.
 
     Raises:
-        InputError: the waypoints are no waypoints, or the trajectory does not move then.
+        InputError: the waypoints are invalid, or the trajectory is at rest then.
         InfeasibleError: a waypoint lies outside the space, or none of the paths tried can be flown from this state.
     """
     joint = joint_at(trajectory, leave).timed(trajectory, 1.0)
@@ -116,10 +116,10 @@ def plan_from_rest(
 ) -> Continuation:
     """Return a certified plan from rest at the first point, (K, 3) m, through the others to rest at the last one.
 
-    If the short search that is used in motion finds no path, the full search follows, for up to SEARCH_TIMEOUT.
+    If the short search used in motion finds no path, the full search follows, for up to SEARCH_TIMEOUT.
 
     Raises:
-        InputError: the points make no path.
+        InputError: the points do not make a path.
         InfeasibleError: one lies outside the space, or none of the paths tried can be flown.
     """
     given = np.asarray(points, dtype=float)
@@ -144,7 +144,7 @@ def plan_from_rest(
 def check_waypoints(points: NDArray, limits: Limits) -> None:
     """Raise InfeasibleError where one of the waypoints, (K, 3) m, lies outside the space."""
     beyond, face = limits.space.nearest(points)
-    if not (good := inside(beyond) | np.isnan(beyond)).all():  # NaN is refused where the path is made
+    if not (good := inside(beyond) | np.isnan(beyond)).all():  # NaN is refused when the path is made
         at = int(np.argmin(good))
         raise InfeasibleError(
             f"{coordinates(points[at], '.3f')} m is {beyond[at]:.3f} m too {limits.space.too(face[at])}",
@@ -159,7 +159,7 @@ def _first_certified(
     """Return the first certified plan along the paths that descents from `begins` find; or why there is none."""
     begun, failure = time.perf_counter(), ""
     tried = replace(limits, plan=with_room(limits.plan, limits.airframe)) if leave_room else limits
-    at_rest = departure.state is None  # the whole motion may be slowed
+    at_rest = departure.state is None  # then the whole motion may be slowed
     factor = min(speed / limits.plan.speed, 1.0) if at_rest else 1.0
     for knots in onward_paths(begins, departure, tried, math.inf if at_rest else speed):
         path, caps = knots.path, None
@@ -183,7 +183,7 @@ def _first_certified(
 
 
 def _slowing_to(speed: float, path: Path, start: BoundaryState) -> SpeedCaps:
-    """Return speed caps along a path, which fall from the vehicle's speed at its start."""
+    """Return speed caps along a path, which fall from the vehicle's present speed."""
     s = np.linspace(0.0, path.end, 4 * default_nodes(path, PLANNER) + 1)
     moving = np.linalg.norm(path(s, 1), axis=1)
     length = np.append(0.0, np.cumsum((moving[1:] + moving[:-1]) / 2.0 * np.diff(s)))
@@ -199,7 +199,7 @@ def _slowing_to(speed: float, path: Path, start: BoundaryState) -> SpeedCaps:
 def with_room(limits: PlanLimits, airframe: Airframe, room: float = ROOM) -> PlanLimits:
     """Return limits that leave a fraction `room` of each to the plan that continues this one.
 
-    A state at a limit can hardly be continued: it leaves almost no choice, and rounding exceeds the limit.
+    A state at a limit can hardly be continued: almost no motion is feasible from it, and rounding exceeds the limit.
     """
     hover, less = airframe.hover_thrust, 1.0 - room
     return PlanLimits(

@@ -1,6 +1,6 @@
-"""A plan, and a flight of it, as a figure for print: the room from above and from the side, and what holds it back.
+"""Figure of a plan and its flight, for print: the room from above and from the side, and the active limits.
 
-White ground, labelled axes in metres of one scale, and for each limit the colour that it has in the rerun view.
+White background, labelled axes in metres with equal scales, and each limit in its colour of the rerun view.
 """
 
 from collections.abc import Sequence
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 SUFFIXES = (".png", ".pdf", ".svg")
-SHOWN = 0.5  # share that a limit comes to somewhere, from which on it gets a curve
-INSET = 0.06  # m at least, half of the side of what is magnified
-FLOWN = "#141414"  # what was flown
+SHOWN = 0.5  # largest usage from which a limit gets a curve
+INSET = 0.06  # m, least half side of the magnified area
+FLOWN = "#141414"  # colour of the flown path
 OBSTACLE = "#c9bfae"
 AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flown:
-    """What was flown of a plan."""
+    """The flown motion along a plan."""
 
     time: NDArray  # (N,) s from the start of the path
     position: NDArray  # (N, 3) m
-    deviation: NDArray  # (N,) m, from where the vehicle should have been at that time
+    deviation: NDArray  # (N,) m, from the plan at that time
 
 
 def check_figure_file(file: Path, *, overwrite: bool) -> None:
-    """Raise InputError where no figure can be written there."""
+    """Raise InputError if no figure can be written there."""
     check_new_file(file, *SUFFIXES, overwrite=overwrite)
 
 
@@ -96,7 +96,7 @@ def caption(plan: Plan, name: str) -> str:
 
 
 def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> None:
-    """Write a figure whole or not at all. Raises InputError where it cannot be written."""
+    """Write a figure atomically. Raises InputError if it cannot be written."""
     from io import BytesIO
 
     check_figure_file(file, overwrite=overwrite)
@@ -106,7 +106,7 @@ def save_figure(figure: "Figure", file: Path, *, overwrite: bool = False) -> Non
 
 
 def _draw_view(axes: "Axes", plan: Plan, active: ActiveLimits, flown: Flown | None, across: int, up: int) -> None:
-    """Draw the room and what is in it along two of its axes."""
+    """Draw the room and its content along two of its axes."""
     from matplotlib.patches import Rectangle
 
     space = plan.limits.space
@@ -159,13 +159,13 @@ def _draw_obstacles(axes: "Axes", space: Space, across: int, up: int) -> None:
 
 
 def draw_path(axes: "Axes", active: ActiveLimits, *along: int) -> None:
-    """Draw the path in the colours of the limits that hold it back, along two or all of the room's axes."""
+    """Draw the path in the colours of its active limits, along two or all of the room's axes."""
     for name, rows in active.stretches():
         axes.plot(*active.position[rows][:, along].T, color=limit_colour(name), lw=2.6)
 
 
 def _magnify(axes: "Axes", active: ActiveLimits, flown: Flown, across: int, up: int) -> None:
-    """Show the largest deviation larger, in the corner that has least of the path in it."""
+    """Magnify the largest deviation, in the corner with the least of the path."""
     worst = int(np.argmax(flown.deviation))
     centre = flown.position[worst, [across, up]]
     half = max(INSET, 2.5 * float(flown.deviation[worst]))

@@ -1,8 +1,8 @@
-"""Lower a profile about the places where it exceeds a limit, until it exceeds none: quick, certain and not optimal.
+"""Lower a profile where it exceeds a limit, until it exceeds none: quick, reliable and not optimal.
 
-No search: each round measures by what factor h would have to fall in every interval for each limit to hold there, as if
-motion grew with a power of speed alone, and lowers log h by the largest factor about, smoothly in time. A lower speed
-brings new slopes, so rounds go on; the slopes become gentler with the speed.
+Each round computes the factor by which h must fall in every interval for each limit to hold, assuming that motion
+scales with a power of speed, and lowers log h by the largest factor nearby, smoothly in time. A lower speed brings new
+slopes, so rounds continue; the slopes become gentler with the speed.
 """
 
 import numpy as np
@@ -19,20 +19,20 @@ from cfplan.vehicle.profile_spline import h_coefficients, spline_profile
 from cfplan.vehicle.yaw_spline import YawSpline
 
 ROUNDS, LATE_ROUNDS = 40, 12  # at most, and after the deadline; ten are usual
-AIM = 0.99  # share of a limit
-MOST = 1.0  # by which log h falls in a round
-STEPS = 6  # of time in which lowering is smoothed
-MOST_STEPS = 200_000  # of a flight, which has coarser ones if it is too long
-BESIDE = 2  # intervals that an excess lowers besides its own
+AIM = 0.99  # usage of limits
+MOST = 1.0  # largest fall of log h in a round
+STEPS = 6  # time steps over which lowering is smoothed
+MOST_STEPS = 200_000  # per flight; longer flights have coarser ones
+BESIDE = 2  # neighbouring intervals that an excess also lowers
 LEAST_H = 1e-12
-UPSIDE_DOWN = 3.0  # share of a limit that counts where a measure is not a number
+UPSIDE_DOWN = 3.0  # usage assumed if a measure is NaN
 
 
 def lower_locally(task: PlanningTask, profile: SpeedProfile) -> SpeedProfile:
     """Return the profile, lower where it exceeds a limit of the task; its yaw, and h at the boundary state, are kept.
 
-    What is left after the last round is for slowing as a whole. Time and memory grow linearly with the intervals; after
-    the task's deadline there are fewer rounds.
+    An excess that remains after the last round is left to slowing as a whole. Time and memory grow linearly with the
+    intervals; after the task's deadline there are fewer rounds.
     """
     path, nodes, yaw = task.path, len(profile.s) - 1, YawSpline.of(profile)
     dense = DensePath(path, nodes, np.zeros(nodes), task.speed_caps)
@@ -57,7 +57,7 @@ def lower_locally(task: PlanningTask, profile: SpeedProfile) -> SpeedProfile:
 def _allowed(dense: DensePath, profile: SpeedProfile, airframe: Airframe, limits: PlanLimits) -> NDArray:
     """Return (N,): by how much log h may rise in each interval until a limit is reached; negative where it must fall.
 
-    A share of a limit is taken to grow with that limit's power of speed.
+    Usage is assumed to scale with the limit's power of speed.
     """
     measured = dense.measures(profile, airframe, limits)
     least = np.full(measured.shape[1], np.inf)

@@ -20,7 +20,7 @@ from cfplan.vehicle.profile import BoundaryState
 
 LEAST_SPEED_FACTOR = 0.01
 BUDGET, BUDGET_PER_METRE = 5.0, 0.02  # s, and s a metre
-ANSWERING = 0.2  # of the time until the deadline, kept for making an answer of what was found
+ANSWERING = 0.2  # of the time until the deadline, kept to complete an unfinished search
 REASONABLE_NODES = range(2, 10 * MOST_NODES + 1)
 
 
@@ -40,13 +40,13 @@ def plan(
 ) -> Plan:
     """Return the fastest certified flight along the path that the planner finds.
 
-    "auto" asks the learned planner, and the expert where that falls short, as policy.POLICIES says. `models` are
-    folders in which models are looked for before those that come with cfplan.
-    `speed_factor` slows the whole result: the same motion at that factor of its speed, so that accelerations fall with
-    its square. Where a boundary state is given, nothing may be slowed, or it would no longer hold.
+    "auto" uses the learned planner, and the expert if that falls short, see policy.POLICIES. `models` are folders of
+    models with precedence over those that come with cfplan.
+    `speed_factor` slows the whole result to that fraction of its speed, so accelerations fall with its square. With a
+    boundary state nothing may be slowed, or the state would not hold.
 
-    By the deadline what is certified is answered; `Plan.left_out` says what there was no time for. A fifth of the time
-    is kept for what makes an answer of an unfinished search: lowering, slowing and their certificates.
+    At the deadline the certified result so far is returned; `Plan.left_out` lists what there was no time for. A fifth
+    of the time is kept to complete an unfinished search by lowering, slowing and their certificates.
 
     Raises:
         InfeasibleError: the path leaves the space, takes longer than the battery lasts, or no profile is found.
@@ -85,7 +85,7 @@ def plan(
 
 
 def default_budget(path: Path) -> float:
-    """Return how long planning a path may take, s, unless another is given."""
+    """Return the default budget for planning a path, s."""
     return BUDGET + BUDGET_PER_METRE * path.length
 
 

@@ -1,7 +1,7 @@
-"""Plans as Parquet files: samples for any reader, and in the metadata what is needed to certify the plan again.
+"""Plans as Parquet files: samples for any reader, and metadata for certifying the plan again.
 
-Path and profile are kept exactly (JSON writes every float so that it reads back the same), so a loaded plan equals the
-saved one. The certificate in the file is for other readers; loading certifies anew.
+Path and profile are stored exactly (JSON floats read back identically), so a loaded plan equals the saved one. The
+certificate in the file is for other readers; loading certifies again.
 """
 
 import json
@@ -33,7 +33,7 @@ _HINT = "make it again with `cfplan plan`"
 
 
 def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:
-    """Write the plan; the file appears whole or not at all.
+    """Write the plan atomically.
 
     Raises:
         InputError: the file cannot be written.
@@ -71,10 +71,10 @@ def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | 
 
 
 def load_plan(file: FilePath | str) -> Plan:
-    """Load a plan and certify it anew.
+    """Load a plan and certify it again.
 
     Raises:
-        InputError: not there, truncated, not a plan, of another format, or at odds with itself.
+        InputError: missing, truncated, not a plan, of another format, or inconsistent.
     """
     import pyarrow
     import pyarrow.parquet
@@ -131,7 +131,7 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
 
 
 def _rebuilt_slowing(slowing: dict[str, Any] | None, path: Path) -> LocalSlowing | None:
-    """Return the slowing of a file, None where it has none, as older ones."""
+    """Return the slowing of a file; None if it has none, like older files."""
     if slowing is None:
         return None
     caps = SpeedCaps.of(slowing["caps"]["s"], slowing["caps"]["speed"])
@@ -159,7 +159,7 @@ def _columns(trajectory: Trajectory) -> dict[str, np.ndarray]:
 
 
 def _check_samples(plan: Plan, table: Any, where: str) -> None:
-    """Check that the samples are those of the plan, so that a reader of either sees the same flight."""
+    """Check that the samples agree with the plan."""
     if table.num_rows != len(_times(plan.trajectory)):
         raise InputError("its samples are not those of its plan", where=where, hint=_HINT)
     columns = _columns(plan.trajectory)

@@ -18,11 +18,11 @@ from cfplan.vehicle.trajectory import Trajectory
 class LocalSlowing:
     """Where a plan is slower than its limits allow, and why.
 
-    Raises InputError where the time without caps is no time or there is no reason.
+    Raises InputError if the time without caps is invalid or there is no reason.
     """
 
     caps: SpeedCaps
-    before: float  # s of flight without them
+    before: float  # s of flight without slowing
     reasons: tuple[str, ...]  # "link loss near the wall x = 2.25 m", the first the worst
 
     def __post_init__(self) -> None:
@@ -36,22 +36,22 @@ class LocalSlowing:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A certified trajectory and how it came about."""
+    """A certified trajectory, and how it was found."""
 
     path: Path
     airframe: Airframe
     limits: Limits
     trajectory: Trajectory
     certificate: Certificate
-    planner: str  # whose profile it is
+    planner: str  # that found the profile
     nodes: int  # intervals of the profile
     repair_speed_factor: float  # on the planner's speed, at which the plan passes; 1: not slowed
-    speed_factor: float  # on that speed, as asked for; 1: not slowed
-    seconds: float  # s that planning took, all tries and certificates included
-    notes: tuple[str, ...]  # what a reader should know, one sentence each
+    speed_factor: float  # requested factor on that speed; 1: not slowed
+    seconds: float  # s, planning time, with all attempts and certificates
+    notes: tuple[str, ...]  # remarks, one sentence each
     joints: tuple[float, ...] = ()  # s, where the windows of a long profile meet
     slowing: LocalSlowing | None = None  # None: nowhere slower than the limits allow
-    left_out: str = ""  # what planning had no time for; empty where its budget was enough
+    left_out: str = ""  # what planning had no time for; empty if the budget sufficed
 
     @property
     def profile(self) -> SpeedProfile:
@@ -60,11 +60,11 @@ class Plan:
 
     @property
     def time_lost(self) -> float:
-        """Return the share of time that local slowing costs; 0 where there is none."""
+        """Return the fraction of time that local slowing costs; 0 if there is none."""
         return self.trajectory.duration / self.slowing.before - 1.0 if self.slowing else 0.0
 
     def describe_slowing(self) -> str:
-        """Return one line, "0.3 % slower for link loss near the wall x = 2.25 m"; empty where there is no slowing."""
+        """Return one line, "0.3 % slower for link loss near the wall x = 2.25 m"; empty if there is no slowing."""
         if not self.slowing:
             return ""
         first, *others = self.slowing.reasons

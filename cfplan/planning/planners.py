@@ -1,4 +1,4 @@
-"""The planners by name: where each is found, on which grid it plans, and whether its profiles are refined."""
+"""The planners by name: their functions, their grids, and whether their profiles are refined."""
 
 import difflib
 from enum import StrEnum
@@ -18,15 +18,15 @@ NODES_PER_PIECE = 4  # of a path, at least
 
 
 class Finish(StrEnum):
-    """What becomes of a planner's profile."""
+    """How a planner's profile is finished."""
 
     REFINED = "refined"  # a proposal: refined to the optimum, whether it passes or not
-    REPAIRED = "repaired"  # it stays where it passes, else it is refined
-    SLOWED = "slowed"  # as a whole where it does not pass
+    REPAIRED = "repaired"  # kept if it passes, else refined
+    SLOWED = "slowed"  # as a whole if it does not pass
 
 
 class PlannerEntry(NamedTuple):
-    """What planning knows of a planner before it is imported."""
+    """Data about a planner that is not imported yet."""
 
     function: str  # module:name
     finished: Finish

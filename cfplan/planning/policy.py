@@ -1,4 +1,4 @@
-"""The policy of planning as a table: which planners are asked, when, in which order and on which grids."""
+"""Planning policies as a table: which planners are called, when, in which order and on which grids."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, replace
@@ -15,8 +15,8 @@ from cfplan.planning.planners import AUTO, PLANNERS, Finish, default_nodes, find
 from cfplan.planning.repair import Repaired, refine, repair, slow
 from cfplan.safety.space import Space
 
-GOOD_SPEED_FACTOR = 0.97  # a profile that repair slows further than this is worth a try on the next grid
-SAME_STATE = 1e-6  # of h, yaw and their derivatives, or of one, within which a boundary state is met
+GOOD_SPEED_FACTOR = 0.97  # a profile that repair slows below this is tried on the next grid
+SAME_STATE = 1e-6  # tolerance on h, yaw and their derivatives of a boundary state
 
 FINISH = MappingProxyType({Finish.REFINED: refine, Finish.REPAIRED: repair, Finish.SLOWED: slow})
 
@@ -40,12 +40,12 @@ class Choice(NamedTuple):
     """The fastest flight that a policy found."""
 
     best: Found
-    notes: tuple[str, ...]  # what a reader should know, one sentence each
-    left_out: str = ""  # what there was no time for; empty where the deadline did not pass
+    notes: tuple[str, ...]  # remarks, one sentence each
+    left_out: str = ""  # what there was no time for; empty if the deadline did not pass
 
 
 class Due(NamedTuple):
-    """Whether a step is taken, and what a reader should know of that."""
+    """Whether a step is taken, with a remark about it."""
 
     due: bool
     notes: tuple[str, ...] = ()
@@ -83,14 +83,14 @@ def _finished(repaired: Repaired) -> bool:
 class Step(NamedTuple):
     """One line of a policy."""
 
-    planners: tuple[str, ...]  # asked in turn until one finds a profile
+    planners: tuple[str, ...]  # tried in order until one finds a profile
     when: Callable[[PlanningTask, Sequence[Found]], Due] = always
     grids: tuple[float, ...] = (1,)  # factors on the first planner's nodes, in turn until its profile is hardly slowed
     finishes: bool = False  # whether grids are tried until a profile needs no slowing at all
 
 
-# Convex and min-snap hardly ever fail, so every policy ends with one of them. Of all that was found the fastest is
-# taken. Whether a planner's profile is refined where it does not pass, or only slowed, stands in PLANNERS.
+# Convex and min-snap hardly ever fail, so every policy ends with one of them. The fastest result is used.
+# PLANNERS defines whether a planner's profile is refined or only slowed if it does not pass.
 POLICIES = MappingProxyType(
     {
         AUTO: (
@@ -110,12 +110,12 @@ POLICIES = MappingProxyType(
 def choose(policy: str, task: PlanningTask, nodes: int | None, space: Space) -> Choice:
     """Return the fastest flight that the policy's steps find.
 
-    `nodes` is the number of intervals where it is given, else each planner's own is taken. Steps that the task's
-    deadline comes before are taken only as long as nothing is found; no search begins then, so they are short.
+    `nodes` is the number of intervals; by default each planner's own. After the task's deadline further steps are taken
+    only while nothing is found; no search begins then, so they are short.
 
     Raises:
-        InfeasibleError: no planner finds a flight; says why of each.
-        InputError: the learned planner is asked and there is no model, or there are too few nodes.
+        InfeasibleError: no planner finds a flight; gives the reason of each.
+        InputError: the learned planner is requested and there is no model, or there are too few nodes.
     """
     found: list[Found] = []
     notes: list[str] = []
@@ -148,7 +148,7 @@ def _left_out(best: Found, skipped: Sequence[str]) -> str:
 
 
 def _take(step: Step, task: PlanningTask, nodes: int | None, space: Space) -> tuple[Found | None, list[str]]:
-    """Return the fastest profile of the first of the step's planners that finds one, and why others found none."""
+    """Return the fastest profile of the first of the step's planners that finds one, and why the others found none."""
     notes: list[str] = []
     for place, planner in enumerate(step.planners):
         own_nodes = default_nodes(task.path, planner) if nodes is None else nodes
@@ -193,7 +193,7 @@ def ask(planner: str, task: PlanningTask, space: Space) -> Found | str:
 
 
 def _missed_boundary(task: PlanningTask, repaired: Repaired) -> str:
-    """Return why a repaired profile does not begin in the task's boundary state; empty where it does."""
+    """Return why a repaired profile does not begin in the task's boundary state; empty if it does."""
     if task.start is None:
         return ""
     reached = astuple(repaired.trajectory.profile.boundary(0))

@@ -1,9 +1,8 @@
 """Repair: turn any profile into a certified trajectory, by the least change.
 
-A profile that passes stays as it is. One that does not is refined: the expert's problem, searched from there, which
-lowers the speed where a limit is exceeded and raises it beside, with yaw and grid left alone. What cannot be refined is
-lowered where it exceeds a limit, and refined from there; what is left is slowed as a whole, which always ends
-certified.
+A profile that passes is unchanged. Otherwise it is refined: the expert's problem is solved from there, which lowers the
+speed where a limit is exceeded and raises it nearby, with the same yaw and grid. If refining fails, the profile is
+lowered where it exceeds a limit, and refined again; if that fails too, it is slowed as a whole, which always passes.
 """
 
 from contextlib import suppress
@@ -30,8 +29,8 @@ from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.timing import duration_of
 from cfplan.vehicle.trajectory import Trajectory
 
-SLOWING_TOLERANCE = 0.02  # by which a share of a limit may exceed 1 for slowing as a whole to be the end of it
-NOTICEABLE = 0.01  # relative change of speed at a place, from which it is reported
+SLOWING_TOLERANCE = 0.02  # usage above 1, up to which slowing as a whole suffices
+NOTICEABLE = 0.01  # relative change of speed, from which it is reported
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +39,9 @@ class Repaired:
 
     trajectory: Trajectory
     certificate: Certificate
-    speed_factor: float  # on the whole; 1: not slowed
+    speed_factor: float  # of the whole profile; 1: not slowed
     before: float  # s of flight before repair
-    slower: float = 0.0  # share of the path along which refining slowed it by more than NOTICEABLE
+    slower: float = 0.0  # fraction of the path slowed by more than NOTICEABLE in refining
     most: float = 0.0  # the largest of these changes, relative to the speed
     where: float = 0.0  # s, of that largest change
     failed: str = ""  # why refining failed, if it did

@@ -1,4 +1,4 @@
-"""From a path file to a mission: planned, certified, encoded, rehearsed, with a way to stop from every setpoint."""
+"""From a path file to a mission: planned, certified, encoded, rehearsed, with a stop from every setpoint."""
 
 __all__ = [
     "export_flight",

@@ -1,7 +1,7 @@
 """Export: a certified plan for other tools, as polynomials of Crazyswarm, as the vehicle's memory, or as samples.
 
-What is written is read again as its receiver reads it, and that is certified. Polynomials are then flown in the
-simulator as the vehicle's own commander flies them.
+The written data is read back the way its receiver does, and certified. Polynomials are then flown in the simulator by
+the vehicle's own commander.
 """
 
 from dataclasses import dataclass, replace
@@ -31,16 +31,16 @@ from cfplan.simulation.on_board_run import on_board_run
 from cfplan.vehicle.measures import measures_of
 from cfplan.vehicle.trajectory import Trajectory
 
-GENTLE = 0.57  # of the limit on angular acceleration: polynomials cannot follow its jumps, and overshoot by as much
+GENTLE = 0.57  # of the limit on angular acceleration: polynomials overshoot at its jumps by the rest
 COLUMNS = ["t", "x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az", "yaw", "wx", "wy", "wz", "qx", "qy", "qz", "qw"]
 _DIGITS = 6
 _ROUNDING = 0.5 * 10.0**-_DIGITS
-COARSE = 0.01  # m from the plan: raw pieces that stray farther are compared with compressed ones
-_STRIDE = 10  # ms between the moments of a dry run from which a correction is learned
+COARSE = 0.01  # m from the plan; raw pieces with larger deviations are compared with compressed ones
+_STRIDE = 10  # ms between the samples of a dry run for learning a correction
 
 
 class Form(Enum):
-    """What an export is for."""
+    """The form of an export."""
 
     CRAZYSWARM = "crazyswarm"
     MEMORY = "memory"
@@ -49,13 +49,13 @@ class Form(Enum):
 
     @property
     def suffix(self) -> str:
-        """Return how its file's name ends."""
+        """Return the suffix of its file."""
         return ".bin" if self in (Form.MEMORY, Form.COMPRESSED) else ".csv"
 
 
 @dataclass(frozen=True, slots=True)
 class ExportedFlight:
-    """Polynomials that may fly, and what they were made from and checked by."""
+    """Certified polynomials, with their plan and checks."""
 
     planned: PlannedFlight
     on_board: OnBoardTrajectory
@@ -83,14 +83,14 @@ class ExportedFlight:
 def plan_for_polynomials(
     source: Path, limits: Limits, options: FlightOptions, on_step: OnStep = ignore_steps
 ) -> PlannedFlight:
-    """Plan a path for polynomials, with less angular acceleration; or read a plan as it is. Raises as plan_flight().
+    """Plan a path for polynomials, with less angular acceleration, or read a plan. Raises as plan_flight().
 
-    A plan that is corrected is planned for polynomials too.
+    A corrected plan is planned for polynomials too.
     """
     if source.suffix == PLAN_SUFFIX and options.correction is None:
         return plan_flight(source, limits, options, on_step)
     gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
-    streamed_loss = replace(limits.link_loss, only_warn=True)  # of a stream, which there is none of
+    streamed_loss = replace(limits.link_loss, only_warn=True)  # there is no stream
     planned = plan_flight(source, replace(limits, plan=gentle, link_loss=streamed_loss), options, on_step)
     uncorrected = planned.uncorrected and replace(planned.uncorrected, limits=limits)
     return replace(planned, limits=limits, uncorrected=uncorrected)
@@ -107,8 +107,8 @@ def fit_polynomials(
 ) -> ExportedFlight:
     """Fit certified polynomials to a plan, and fly them in the simulator.
 
-    The form MEMORY is compressed, in at most `room` bytes, where `most` pieces are too few, or follow the plan coarsely
-    and compressed ones do not. Raises NotCertifiedError where no polynomials keep the limits near the plan, or the dry
+    The form MEMORY is compressed, in at most `room` bytes, if `most` raw pieces are too few, or follow the plan less
+    closely than compressed ones. Raises NotCertifiedError if no polynomials keep the limits near the plan, or the dry
     run fails.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
@@ -130,7 +130,7 @@ def fit_polynomials(
 
 
 def _raw_or_compressed(trajectory: Trajectory, limits: Limits, leads: bool, most: int, room: int) -> OnBoardTrajectory:
-    """Return raw pieces, or compressed ones where raw ones are too few or coarse: of those what is nearer the plan."""
+    """Return raw pieces, or compressed ones if raw ones are too few or too coarse and these are nearer the plan."""
     try:
         raw = certified_pieces(trajectory, limits, leads=leads, most=most)
     except NotCertifiedError:
@@ -147,7 +147,7 @@ def _raw_or_compressed(trajectory: Trajectory, limits: Limits, leads: bool, most
 def _corrected(
     made: OnBoardTrajectory, run: DryRun, planned: PlannedFlight, most: int, room: int, on_step: OnStep
 ) -> tuple[OnBoardTrajectory, DryRun]:
-    """Return polynomials that take back by how much these strayed in their dry run, and theirs, if that is less."""
+    """Return polynomials corrected by their dry run, with a new dry run, if that reduces the deviation."""
     trajectory, limits = planned.plan.trajectory, planned.limits
     times = run.loop.time[::_STRIDE]
     strayed = run.loop.position[::_STRIDE] - made.reference.plan_at(times)[:, 0, :3]
@@ -180,7 +180,7 @@ def _describe(made: OnBoardTrajectory, planned: PlannedFlight) -> str:
 
 
 def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
-    """Write polynomials, and read them again as their receiver does. Raises InputError, or NotCertifiedError."""
+    """Write polynomials, and read them back like their receiver. Raises InputError or NotCertifiedError."""
     pieces = exported.on_board.pieces
     if form is not Form.CRAZYSWARM:
         write_atomically(file, exported.on_board.memory)
@@ -194,9 +194,9 @@ def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
 
 
 def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
-    """Write a plan's states at `rate`, Hz, with its end, and check what was written; return how many.
+    """Write a plan's states at `rate`, Hz, including its end, and check the file; return the number of samples.
 
-    Raises InputError, or NotCertifiedError where the plan's certificate or a sample does not keep the limits.
+    Raises InputError, or NotCertifiedError if the plan's certificate or a sample exceeds a limit.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
     worst = planned.certificate.worst
@@ -225,7 +225,7 @@ def sample_rows(trajectory: Trajectory, rate: float) -> NDArray:
 
 
 def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: str) -> None:
-    """Check that samples, (N, 18), are those of a trajectory at their times, and within the limits; but for rounding.
+    """Check that samples, (N, 18), agree with a trajectory and keep the limits, up to rounding.
 
     Raises NotCertifiedError with the line.
     """
@@ -233,7 +233,7 @@ def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: 
     expected = [
         state.position, state.velocity, state.acceleration, state.yaw, state.body_rate, state.quaternion,
     ]  # fmt: skip
-    slack = 50.0 * _ROUNDING  # the time is rounded too, and what it moves by meanwhile
+    slack = 50.0 * _ROUNDING  # includes the motion within the rounding of time
     measured = measures_of(rows[:, 4:7], rows[:, 7:10], rows[:, 11:14], state.thrust_axis, state.specific_thrust)
     exceeded = [q.excess(q.worst(measured), q.allowed(limits.plan)) > slack for q in INSTANT]
     wrong = np.abs(rows[:, 1:] - np.column_stack(expected)).max(axis=1) > slack

@@ -19,7 +19,7 @@ from cfplan.simulation.dry_run import DryRun
 def load_path(source: Path | str | ArrayLike) -> PathFile:
     """Return the path of a path file, or through waypoints, (K, 3) m, at yaw 0.
 
-    Raises InputError, with place and hint, if the file does not exist or has a mistake, or the points are not such.
+    Raises InputError, with place and hint, if the file does not exist or has a mistake, or the points are invalid.
     """
     return path_file.load_path_file(source) if isinstance(source, Path | str) else path_file.path_through(source)
 
@@ -41,7 +41,7 @@ def plan(
         planner: "auto", "learned", "expert", "convex", …; docs/planning.md has them.
         speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes the path's own.
         budget: s that planning and giving way may take together; None chooses it by the path's length.
-        on_step: hears of the steps of planning.
+        on_step: called with the steps of planning.
 
     Raises:
         InputError: a file or an argument is wrong.
@@ -63,7 +63,7 @@ def plan(
 def rehearse(plan: PlannedFlight, *, on_step: OnStep = ignore_steps) -> DryRun:
     """Fly the plan's own setpoints in the simulator, as `cfplan fly` does in its dry run; `.deviation` is the worst, m.
 
-    Raises NotCertifiedError where the certificate, the setpoints or the dry run do not pass.
+    Raises NotCertifiedError if the certificate, the setpoints or the dry run fail.
     """
     if not isinstance(plan, PlannedFlight):
         raise InputError(

@@ -1,4 +1,4 @@
-"""Glitch margin as an assessment: how near a gap in setpoints or poses, beginning at any setpoint, comes to a loss."""
+"""Glitch assessment: how close a gap in setpoints or poses from any setpoint on comes to losing the vehicle."""
 
 import numpy as np
 
@@ -8,14 +8,14 @@ from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
 from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_sampled_setpoints
 
-KEPT = 0.9  # share of what is lost, that planning stays within
+KEPT = 0.9  # usage that planning keeps; at 1 the vehicle counts as lost
 _HINT = "make the path gentler there, or plan with a lower speed or acceleration"
 
 
 def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
-    """Simulate a gap at each setpoint; at fault is what nearly loses the vehicle, by its deviation or its tilt."""
+    """Simulate a gap at each setpoint; one is at fault if deviation or tilt nearly lose the vehicle."""
     moments, cut = glitch_at_sampled_setpoints(encoded.payloads, limits), limits.flight.deviation.cut
-    shares = np.fmax(moments.deviation / cut, moments.tilt / TURNED_OVER)  # (3, N) of what is lost
+    shares = np.fmax(moments.deviation / cut, moments.tilt / TURNED_OVER)  # (3, N), 1: lost
     shares[moments.lost & ~(shares >= 1.0)] = np.inf
     kind, share = np.argmax(shares, axis=0), shares.max(axis=0)
 

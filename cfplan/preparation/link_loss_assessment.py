@@ -1,10 +1,10 @@
-"""Assess link loss: how far beyond the walls the vehicle ends if each setpoint is the last one.
+"""Link-loss assessment: how far beyond the walls the vehicle ends if each setpoint is the last one.
 
-Setpoints of the stops are assessed too. They are a hundred times as many as those of the plan, so they are sampled:
-every tenth stop after every twelfth of its setpoints, and more densely around those that come near a wall or send more
-than harmless rates, up to every stop after every other setpoint (GRIDS).
+Setpoints of stops are assessed too. There are a hundred times as many as in the plan, so they are sampled: every tenth
+stop at every twelfth of its setpoints, and more densely around those that end near a wall or send more than harmless
+rates, up to every stop at every other setpoint (GRIDS).
 
-Most setpoints are far from all walls, which a coarse simulation shows with a margin. Those that may end outside are
+Most setpoints are far from all walls, as a coarse simulation shows with a margin. Those that may end outside are
 simulated with every motor lag.
 """
 
@@ -27,18 +27,18 @@ from cfplan.simulation.link_loss import (
     link_loss_within_stops,
 )
 
-MARGIN = 0.02  # m inside the walls that planning aims at: what the last refinement changes stays within
+MARGIN = 0.02  # m inside the walls, planning's target; more than the last refinement changes
 OUTSIDE_HINT = (
     "keep the path farther from there; in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 )
 _LEAST_REACH = 1e-3  # m
-STOPS_EVERY, STOPS_EACH = 10, 12  # setpoints between sampled stops, and within them
+STOPS_EVERY, STOPS_EACH = 10, 12  # setpoints between sampled stops, and between samples within a stop
 GRIDS = ((STOPS_EVERY, STOPS_EACH, 0.18), (3, 4, 0.1), (1, 2, 0.0))
-"""The same on denser grids, of which each is used about what came within so many m of a wall on the one before."""
+"""Denser grids, each used around samples that ended within the given distance, m, of a wall on the one before."""
 
 
 def assess_link_loss(encoded: EncodedFlight, limits: Limits, margin: float = MARGIN) -> Assessment:
-    """Simulate that each setpoint is the last one; what comes down within `margin`, m, of a wall is at fault."""
+    """Simulate each setpoint as the last one; it is at fault if the vehicle ends within `margin`, m, of a wall."""
     moments, faces = link_loss_near_walls(encoded.payloads, limits, margin), limits.space.faces
 
     def describe(at: int) -> str:
@@ -63,11 +63,11 @@ def assess_link_loss_of_stops(
     margin: float = MARGIN,
     stops: NDArray | None = None,
 ) -> Assessment:
-    """Simulate that the link is lost within stops from the setpoints of a flight, whose own link loss is `plan`.
+    """Simulate link loss within stops from the setpoints of a flight, whose own link loss is `plan`.
 
-    `stops`, (N, M, 29) uint8, are those from every setpoint; where they are not given, they are made as needed. A
-    setpoint is at fault for a stop that was sampled from it; one from which none was is not. What was only looked at
-    coarsely counts as ending as far out as it may.
+    `stops`, (N, M, 29) uint8, are those from every setpoint; if not given, they are made as needed. A setpoint is at
+    fault for a stop sampled from it, never without one. Samples that were only simulated coarsely count with their
+    upper bound.
     """
     count, length = len(encoded.payloads), round(DURATION * RATE) + 1
     sampled = _Sampled(np.full(count, -np.inf), np.full(count, _LEAST_REACH), np.zeros(count, dtype=int))
@@ -104,9 +104,9 @@ def assess_link_loss_of_stops(
 
 @dataclass(frozen=True, slots=True)
 class _Sampled:
-    """The worst that was sampled of the stops from each setpoint; written as samples come."""
+    """The worst sample of the stops from each setpoint, updated in place."""
 
-    beyond: NDArray  # (N,) m beyond a face of the space; -inf where no stop was sampled
+    beyond: NDArray  # (N,) m beyond a face of the space; -inf if no stop was sampled
     reach: NDArray  # (N,) m
     face: NDArray  # (N,) int, of the space
 
@@ -121,10 +121,10 @@ def _sample(
     *,
     margin: float,
 ) -> NDArray:
-    """Lose the link in the stops from the setpoints and after the rows that are `asked`, (N, M).
+    """Simulate link loss in the stops and at the rows marked in `asked`, (N, M).
 
-    `made` returns the stops from some setpoints. Returns, (N, M), how far beyond the walls they end, as seen coarsely;
-    what sends more than harmless rates is at inf, what was not looked at at -inf.
+    `made` returns the stops from some setpoints. Returns, (N, M), how far beyond the walls they end by the coarse
+    simulation: inf for more than harmless rates, -inf if not simulated.
     """
     begin = np.flatnonzero(asked.any(axis=1))
     forks, starts = asked[begin], plan.snapshots[:, begin]
@@ -158,7 +158,7 @@ def _sample(
 
 
 def _about(near: NDArray, every: int, each: int) -> NDArray:
-    """Return, (N, M), what lies about what is `near`, (N, M), not farther than the next samples."""
+    """Return, (N, M), the neighbourhood of the samples that are `near`, (N, M), up to the next samples."""
     return _closer_than(every, _closer_than(each, near.T).T)
 
 
@@ -170,7 +170,7 @@ def _closer_than(distance: int, near: NDArray) -> NDArray:
 
 
 def _every(count: int, step: int) -> NDArray:
-    """Return (N,) bool: so many apart, and the last."""
+    """Return (N,) bool: every `step`-th, and the last."""
     number = np.arange(count)
     return (number % step == 0) | (number == count - 1)
 

@@ -1,8 +1,8 @@
-"""Local slowing: the speed is lowered along a path where a setpoint would end badly, until no setpoint does.
+"""Local slowing: lower the speed along a path around setpoints that fail an assessment, until none does.
 
-What ends badly is for an assessment of every setpoint to say (link loss, a gap in the setpoints). Where one is at
-fault, the speed about it is capped at a share of what it was, as far as its excess asks, and the profile is refined
-under these caps from where it was; so the rest of the flight stays as fast as it can be.
+An assessment judges every setpoint (link loss, a gap in the setpoints). Around a setpoint at fault the speed is capped
+at a fraction that depends on its excess, and the profile is refined under these caps from its previous state, so the
+rest of the flight stays as fast as it can be.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,19 +22,19 @@ from cfplan.simulation.link_loss import LinkLossMoments
 from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 
-ROUNDS = 12  # of lowering caps, at most
-TRIALS, CHEAP = 4, 0.005  # to win time back, where a plan loses more than this share of it
-PLACES = 4  # of caps in an interval
-LEAST_SHARE, MOST_SHARE = 0.5, 0.98  # of its speed, to which a place is slowed in a round
-POWER = 1.5  # of speed, with which the way that is left grows: some of it is v t, some v² / a
-ABOUT = 0.1  # s of flight before and after a setpoint at fault, along which a first round slows; later ones slow more
+ROUNDS = 12  # at most, of lowering caps
+TRIALS, CHEAP = 4, 0.005  # attempts to regain time, if a plan loses more than this fraction of it
+PLACES = 4  # of caps per interval
+LEAST_SHARE, MOST_SHARE = 0.5, 0.98  # fractions of its speed to which a place is slowed in one round
+POWER = 1.5  # of speed, with which the remaining distance grows: part of it is v t, part v² / a
+ABOUT = 0.1  # s of flight around a setpoint at fault, slowed in the first round; later rounds slow more
 LEAST_SPEED = 0.05  # m/s, of caps
-LEADING_UP = 0.4  # s about a setpoint that decide how it ends: caps that are the least there leave nothing to do
+LEADING_UP = 0.4  # s around a setpoint that affect its end: if all caps there are at the minimum, nothing helps
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedLinkLoss:
-    """Link loss at every setpoint of a flight, for whoever has the same bytes."""
+    """Link loss at every setpoint of a flight, to be reused for the same bytes."""
 
     payloads: NDArray  # (N, 29) uint8, at RATE
     moments: LinkLossMoments
@@ -42,25 +42,25 @@ class SimulatedLinkLoss:
 
 @dataclass(frozen=True, slots=True)
 class Assessment:
-    """How each setpoint of a flight ends, were it the last one or followed by a gap."""
+    """How a flight ends at each setpoint, if that is the last one or followed by a gap."""
 
-    what: str  # as it is called, "link loss"
+    what: str  # its name, "link loss"
     time: NDArray  # (N,) s of the trajectory at each setpoint
-    excess: NDArray  # (N,) by how much it ends beyond what is allowed; at most 0 where all is well
-    reach: NDArray  # (N,) in the same unit, positive: what falls with speed, and of which the excess is too much
+    excess: NDArray  # (N,) how far it ends beyond the allowed bound; at most 0 if it passes
+    reach: NDArray  # (N,) in the same unit, positive: the part that shrinks with speed
     describe: Callable[[int], str]  # of a setpoint at fault: "ends 0.12 m beyond the wall x = 2.25 m"
     near: Callable[[int], str]  # of a setpoint at fault: "the wall x = 2.25 m"
-    hint: str  # what to do where slowing does not help
-    simulated: SimulatedLinkLoss | None = None  # what an assessment of link loss was made from
+    hint: str  # remedy if slowing does not help
+    simulated: SimulatedLinkLoss | None = None  # the simulation behind an assessment of link loss
 
     @property
     def worst(self) -> int:
-        """Return the number of the setpoint that ends worst; what is not a number is worst of all."""
+        """Return the number of the worst setpoint; NaN is worst."""
         return int(np.argmax(np.where(np.isnan(self.excess), np.inf, self.excess)))
 
     @property
     def at_fault(self) -> NDArray:
-        """Return (N,) whether each setpoint ends beyond what is allowed."""
+        """Return (N,) whether each setpoint ends beyond the allowed bound."""
         return ~np.asarray(inside(self.excess))
 
     @property
@@ -73,12 +73,12 @@ Assess = Callable[[Trajectory], Sequence[Assessment]]
 
 
 def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tuple[Plan, Sequence[Assessment]]:
-    """Return the plan itself if all its setpoints end well, else one that is slower where they do not; and how it ends.
+    """Return the plan if all its setpoints pass, else one that is slower where they do not; and its assessments.
 
-    After the deadline plans are lowered to the caps, not refined, and no time is won back.
+    After the deadline plans are lowered to the caps without refining, and no time is regained.
 
     Raises:
-        InfeasibleError: a setpoint ends badly however slow the flight is there; says where, by how much, what helps.
+        InfeasibleError: a setpoint fails at any speed; the message has place, excess and remedy.
     """
     assessed = assess(plan.trajectory)
     if _passed(assessed):
@@ -111,7 +111,7 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
 def _faster(
     plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps, deadline: Deadline
 ) -> tuple[Plan, Sequence[Assessment]]:
-    """Return a faster plan that passes too: caps are raised half the way where that brings no setpoint to fault."""
+    """Return a faster plan that passes too: caps are raised half-way as long as no setpoint fails."""
     places = np.array(caps.s)
     highest = np.minimum(_speed_at(plan.trajectory, places), plan.limits.plan.speed)
     raised = highest > caps.speed
@@ -121,7 +121,7 @@ def _faster(
             break
         between = np.sqrt(np.array(caps.speed) * np.maximum(highest, caps.speed))
         trial = SpeedCaps.of(places, np.where(raised, between, caps.speed))
-        # From the slow one nothing would be gained.
+        # Refining from the slow plan would gain nothing.
         faster = under_caps(plan, plan, trial, slowed.slowing.reasons, deadline)
         assessed = assess(faster.trajectory)
         if not _passed(assessed):
@@ -148,7 +148,7 @@ def _worst_of_arcs(assessment: Assessment) -> list[int]:
 
 
 def _lowered(trajectory: Trajectory, assessment: Assessment, caps: SpeedCaps, done: int) -> SpeedCaps | None:
-    """Return lower caps, that should do after `done` rounds that did not; None where they are the least already."""
+    """Return lower caps after `done` rounds that did not suffice; None if they are at the minimum already."""
     s = np.array(caps.s)
     speed, before = _speed_at(trajectory, s), np.array(caps.speed)
     at_fault = np.flatnonzero(assessment.at_fault)

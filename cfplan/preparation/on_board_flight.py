@@ -1,10 +1,10 @@
-"""The way of the data from a path file to a flight on board: polynomials for the vehicle's own commander.
+"""Prepare an on-board flight: from a path file to polynomials for the vehicle's own commander.
 
     path file → plan → slower where its fall would leave the walls → polynomials, certified as decoded → dry run
               → landing at their end → stops by go-to → mission
 
-The vehicle has no time-out for what its commander flies. Its watchdog must stop the motors when the link dies, and from
-each moment it must fall inside the walls.
+The commander has no time-out. The watchdog must stop the motors when the link dies, and from each moment the vehicle
+must fall inside the walls.
 """
 
 from dataclasses import dataclass, replace
@@ -39,8 +39,8 @@ from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import LinkLoss
 from cfplan.vehicle.trajectory import Trajectory
 
-_MARGIN = 0.02  # m inside the walls that planning aims at: polynomials are slower than their plan, not quite on it
-_DEVIATION = 0.04  # m, that planning expects of the dry run
+_MARGIN = 0.02  # m inside the walls, planning's target: polynomials are slower than their plan, and near it
+_DEVIATION = 0.04  # m, assumed in planning for the dry run
 _FALL_HINT = (
     "keep the path farther from there, or fly it with a lower --speed; in a room with nets, write `outside: warn` "
     "under `link_loss` in safety.yaml"
@@ -49,11 +49,11 @@ _FALL_HINT = (
 
 @dataclass(frozen=True, slots=True)
 class PreparedOnBoard:
-    """A mission that may fly on board, and what it was made from and checked by."""
+    """A certified on-board mission, with its plan and checks."""
 
     planned: PlannedFlight
     dry_run: DryRun
-    link_loss: LinkLoss  # here the fall once the watchdog has stopped the motors
+    link_loss: LinkLoss  # the fall once the watchdog has stopped the motors
     mission: Mission
 
     @property
@@ -102,7 +102,7 @@ def prepare_on_board_flight(
 
 
 def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
-    """Return the plan, slower where the vehicle would fall beyond the walls. Raises InfeasibleError where it must."""
+    """Return the plan, slower where the vehicle would fall beyond the walls. Raises InfeasibleError if none helps."""
 
     space = planned.limits.space
 
@@ -133,9 +133,9 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
 def _require_harmless_fall(
     made: OnBoardTrajectory, limits: Limits, deviation: float, on_step: OnStep
 ) -> tuple[LinkLoss, str]:
-    """Stop the motors at every moment of a trajectory; return the worst, and its words.
+    """Simulate the motors stopping at every moment of a trajectory; return the worst case, and its description.
 
-    Raises NotCertifiedError where the vehicle falls beyond a wall, unless safety.yaml says only to warn.
+    Raises NotCertifiedError if the vehicle falls beyond a wall, unless safety.yaml says only to warn.
     """
     time = np.arange(int(np.ceil(made.duration * RATE)) + 1) / RATE
     with step(on_step, "link loss on board") as results:
@@ -155,7 +155,7 @@ def _require_harmless_fall(
 
 
 def _as_slow(planned: PlannedFlight, made: OnBoardTrajectory) -> PlannedFlight:
-    """Return the plan as slow as the polynomials that were made of it, certified anew."""
+    """Return the plan slowed like its polynomials, certified again."""
     plan, limits, slowing = planned.plan, planned.limits, made.reference.slowing
     if slowing != 1.0:
         trajectory = Trajectory(plan.path, plan.profile.slowed(1.0 / slowing), plan.airframe)
@@ -166,9 +166,9 @@ def _as_slow(planned: PlannedFlight, made: OnBoardTrajectory) -> PlannedFlight:
 
 
 def _mission(plan: Plan, limits: Limits, made: OnBoardTrajectory, on_step: OnStep) -> Mission:
-    """Return the mission, in whose setpoints and stops the pilot sees what the vehicle flies by itself.
+    """Return the mission, whose setpoints and stops describe the motion of the vehicle's commander to the pilot.
 
-    Raises NotCertifiedError where a stop exceeds what stops may reach, or leaves the space less its margin.
+    Raises NotCertifiedError if a stop exceeds the limits of stops, or leaves the space less its margin.
     """
     gains, space = gains_under(limits), limits.space
     encoded = encode_trajectory(plan.trajectory, hold=TAIL, gains=gains, space=space)
@@ -184,7 +184,7 @@ def _mission(plan: Plan, limits: Limits, made: OnBoardTrajectory, on_step: OnSte
 
 
 def check_stops(stops: NDArray, limits: Limits) -> None:
-    """Check what stops, (N, M, 5, 4) states, reach. Raises NotCertifiedError with the moment of the first at fault."""
+    """Check the limits of stops, (N, M, 5, 4) states. Raises NotCertifiedError with the first moment at fault."""
     count = stops.shape[1]
     states = stops.reshape(-1, 5, 4)
     measured = measures_along(Samples(np.zeros(len(states)), states, np.zeros(len(states), bool)), limits.airframe)

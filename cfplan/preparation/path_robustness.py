@@ -1,7 +1,7 @@
 """Measure how a plan changes with its path: perturb the path, plan it again, and fly it in the dry run.
 
-A path that is measured or drawn slightly differently should give nearly the same flight. The paper tests its networks
-for this; here any planner can be tested.
+A slightly different path should give nearly the same flight. The paper tests its networks for this; here any planner
+can be tested.
 """
 
 import pathlib
@@ -30,11 +30,11 @@ SAMPLES = 500  # points along the path at which speed and yaw are compared
 
 @dataclass(frozen=True, slots=True)
 class PerturbedPlan:
-    """The path perturbed once, planned and rehearsed. NaN where there was nothing to measure."""
+    """One perturbed path, planned and rehearsed; NaN for missing values."""
 
     epsilon: float  # m
     draw: int
-    reason: str = ""  # why it was not planned, or why its setpoints or dry run were refused
+    reason: str = ""  # why planning, setpoints or dry run failed
     flight: float = np.nan  # s
     longer: float = np.nan  # relative change of the time of flight
     faster: float = np.nan  # m/s, largest change of speed at a fraction of the path, either way
@@ -44,7 +44,7 @@ class PerturbedPlan:
 
 @dataclass(frozen=True, slots=True)
 class ScaleSummary:
-    """All plans whose paths were perturbed by the same distance; NaN where there was nothing to measure."""
+    """All plans with perturbations of the same size; NaN for missing values."""
 
     epsilon: float  # m
     plans: int

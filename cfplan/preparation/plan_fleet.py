@@ -1,16 +1,21 @@
 """From a fleet file to certified plans that keep apart.
 
-fleet file → each vehicle's plan → start delays and clock rates → the certificate of every pair
+fleet file → each vehicle's plan → start delays and clock rates → the certificates of every pair and of lost vehicles
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.stops import stop_clock
 from cfplan.planning.fleet.coordination import Blocked, coordinate
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
+from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
@@ -21,6 +26,11 @@ from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun
+from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
+
+TRACKING = 0.05  # m that a vehicle may be off its path; `apart` has it for two vehicles, and a tube needs neither
+FLY_ON = False  # after the loss of another vehicle: the conductor lets all brake
+_LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +42,7 @@ class PlannedFleet:
     skew: float  # s
     members: tuple[FleetMember, ...]
     separations: tuple[Separation, ...]  # of every pair, the nearest first
+    losses: tuple[Loss, ...]  # of every vehicle and every shared dongle, the nearest first
     alone: float  # s, the longest plan before coordination
     limits: Limits
 
@@ -65,6 +76,27 @@ class PlannedFleet:
             for each in self.separations
         ]
 
+    @property
+    def lost_keep(self) -> float:
+        """Return the distance that others keep from a lost vehicle, m."""
+        return lost_clearance(self.apart)
+
+    def loss_rows(self) -> list[tuple[str, ...]]:
+        """Return a row of text per loss: vehicles, nearest pair, distances, time, place, reaction, exposed time."""
+        return [
+            (
+                ", ".join(each.vehicles),
+                " – ".join(each.pair),
+                f"{each.distance:.3f} m",
+                f"{self.lost_keep:.3f} m",
+                f"{each.time:.2f} s",
+                f"{each.place[0]:.2f}, {each.place[1]:.2f}",
+                each.reaction,
+                f"{100 * each.exposed:.0f} %",
+            )
+            for each in self.losses
+        ]
+
     def to_dict(self) -> dict[str, Any]:
         """Return the figures of the fleet, for JSON."""
         vehicles = zip(self.members, self.flights, strict=True)
@@ -79,6 +111,7 @@ class PlannedFleet:
                 {"pair": each.pair, "distance": each.distance, "place": each.place, "time": each.time}
                 for each in self.separations
             ],
+            "lost": [asdict(each) for each in self.losses],
         }
 
 
@@ -106,24 +139,27 @@ def plan_fleet(
             if plan.slowing:
                 results.append(plan.describe_slowing())
         alone.append(FleetMember(vehicle.name, plan))
-    return coordinate_fleet(fleet.name, alone, limits, (fleet.apart, fleet.skew), on_step)
+    return coordinate_fleet(fleet, alone, limits, on_step)
 
 
 def coordinate_fleet(
-    name: str, alone: Sequence[FleetMember], limits: Limits, keeps: tuple[float, float], on_step: OnStep = ignore_steps
+    fleet: FleetFile, alone: Sequence[FleetMember], limits: Limits, on_step: OnStep = ignore_steps
 ) -> PlannedFleet:
-    """Coordinate certified plans, and certify every pair.
+    """Coordinate certified plans; certify every pair, and every vehicle and dongle that may be lost.
 
-    `keeps` are the distance, m, and the skew, s. Raises InfeasibleError and NotCertifiedError as plan_fleet().
+    Raises InfeasibleError and NotCertifiedError as plan_fleet().
     """
-    apart, skew = keeps
     longest = max(member.plan.trajectory.duration for member in alone)
+    model = loss_model(fleet, limits)
     with step(on_step, "coordination") as results:
-        members = coordinate(alone, apart, skew, _given_way)
+        members = coordinate(alone, fleet.apart, fleet.skew, _given_way, model)
+        avoids_lost = not isinstance(members, Blocked)
+        if isinstance(members, Blocked):
+            members = coordinate(alone, fleet.apart, fleet.skew, _given_way)
         if isinstance(members, Blocked):
             raise InfeasibleError(
-                f"no start delays and clock rates keep the vehicles {apart:g} m apart: {members}",
-                where=name,
+                f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {members}",
+                where=fleet.name,
                 hint="move that path with `place`, or reverse its waypoints",
             )
         waiting = sum(member.delay > 0.0 for member in members)
@@ -132,14 +168,45 @@ def coordinate_fleet(
         results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
         results.append(f"waiting at the start: {waiting}, slowed: {slower}")
     with step(on_step, "separation") as results:
-        found = separations(members, skew)
+        found = separations(members, fleet.skew)
         results.append(f"nearest {found[0]}")
         for each in found:
-            if not each.keeps(apart):
+            if not each.keeps(fleet.apart):
                 raise NotCertifiedError(
-                    f"{each}; they must keep {apart:g} m", where=name, hint="plan the fleet again, or move a path"
+                    f"{each}; they must keep {fleet.apart:g} m",
+                    where=fleet.name,
+                    hint="plan the fleet again, or move a path",
                 )
-    return PlannedFleet(name, apart, skew, members, found, longest, limits)
+    with step(on_step, "lost vehicles") as results:
+        losses = model.losses(members, range(len(members)), fleet.skew)
+        (results.append if avoids_lost else results.warn)(str(losses[0]))
+        if not avoids_lost and not fleet.lost_only_warns:
+            raise InfeasibleError(
+                f"no start delays and clock rates keep {model.clearance:.2f} m from a lost vehicle: {losses[0]}",
+                where=fleet.name,
+                hint=_LOST_HINT,
+            )
+    return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
+
+
+def lost_clearance(apart: float) -> float:
+    """Return the distance, m, from a tube to the others: tubes enclose what the lost vehicle deviates by."""
+    return apart - 2.0 * TRACKING
+
+
+def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
+    """Return where the vehicles of a fleet go when they are lost, and how they stop."""
+    tubes: dict[int, tuple[Plan, Tube]] = {}
+
+    def tube(plan: Plan) -> Tube:
+        if id(plan) not in tubes:
+            payloads = encode_flight(PlannedFlight("", plan, limits)).payloads
+            boxes = link_loss_tubes(payloads, limits, np.arange(len(payloads)))
+            tubes[id(plan)] = plan, Tube(boxes, RATE, 0.001 * TUBE_PART)
+        return tubes[id(plan)][1]
+
+    stop = stop_clock(RATE)[0] / RATE
+    return LossModel(tube, stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart), FLY_ON)
 
 
 def _given_way(plan: Plan) -> Plan:

@@ -1,4 +1,4 @@
-"""From a path file or a plan file to a plan that is certified under today's limits."""
+"""From a path file or a plan file to a plan that is certified under the present limits."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -44,7 +44,7 @@ class FlightOptions:
     planner: str = AUTO
     nodes: int | None = None  # grid intervals; None chooses them by the path's length
     speed_factor: float | None = None  # of the speed that the limits allow; None takes the path file's
-    stream_for: float = 0.0  # s of setpoints at least; behind the end of the path they hover
+    stream_for: float = 0.0  # s, least duration of the setpoints, which hover after the end of the path
     budget: float | None = None  # s that planning and giving way may take; None chooses it by the path's length
     models: tuple[Path, ...] = ()  # folders of models to look in first
     correction: PlanCorrection | None = None  # of a plan file, learned from earlier flights of it
@@ -57,11 +57,11 @@ class PlannedFlight:
     name: str
     plan: Plan
     limits: Limits
-    link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, where planning looked at it
-    was_read: bool = False  # from a plan file, so that nothing but its limits was checked yet
-    path_file: PathFile | None = None  # what was planned, where that is known
-    fastest: FastestPath | None = None  # the choice of its path, where one was made
-    uncorrected: Plan | None = None  # where the vehicle is wanted, if what it is asked to fly is corrected
+    link_loss: SimulatedLinkLoss | None = None  # of the plan's bytes, if planning simulated it
+    was_read: bool = False  # from a plan file, for which only the limits have been checked
+    path_file: PathFile | None = None  # source of the plan, if known
+    fastest: FastestPath | None = None  # the choice of its path, if there was one
+    uncorrected: Plan | None = None  # the plan before its correction, if there is one
 
     def __repr__(self) -> str:
         verdict = "certified" if self.certificate.passed else "not certified"
@@ -79,7 +79,7 @@ class PlannedFlight:
         return self.plan.trajectory.duration
 
     def save(self, file: Path | str, provenance: Mapping[str, str] | None = None) -> None:
-        """Write the plan as a Parquet file that `plan_flight` reads. Raises InputError where it cannot."""
+        """Write the plan as a Parquet file that `plan_flight` reads. Raises InputError if it cannot be written."""
         if Path(file).suffix != PLAN_SUFFIX:
             raise InputError(
                 f"the name of a plan file must end in {PLAN_SUFFIX}", where=str(file), hint=f"add {PLAN_SUFFIX}"
@@ -87,7 +87,7 @@ class PlannedFlight:
         save_plan(self.plan, file, {"name": self.name} | dict(provenance or {}))
 
     def plot(self) -> "Figure":
-        """Return the plan drawn in its room, with what holds it back: a matplotlib figure, for `.savefig(file)`."""
+        """Return a matplotlib figure of the plan in its room, with its active limits, for `.savefig(file)`."""
         from cfplan.planning.figure import draw_plan
 
         return draw_plan(
@@ -95,20 +95,20 @@ class PlannedFlight:
         )
 
     def save_figure(self, file: Path, *, overwrite: bool = False) -> None:
-        """Write the drawing as .png, .pdf or .svg. Raises InputError where it cannot."""
+        """Write the drawing as .png, .pdf or .svg. Raises InputError if it cannot be written."""
         from cfplan.planning.figure import save_figure
 
         save_figure(self.plot(), file, overwrite=overwrite)
 
     def lower_bound(self) -> float:
-        """Return the time, s, that no flight along the path beats at the plan's speed factor; takes up to a second."""
+        """Return a lower bound, s, on flight times along the path at the plan's speed factor; takes up to a second."""
         plan = self.plan
         return lower_bound(PlanningTask(plan.path, plan.airframe, self.limits.plan)) / plan.speed_factor
 
     def point_mass_bound(self) -> float | None:
         """Return the time, s, of a point mass with these limits on speed and acceleration through the waypoints.
 
-        None where the path was not chosen, where there are too many waypoints, and where none is found.
+        None if the path was not chosen, there are too many waypoints, or none is found.
         """
         if self.path_file is None or self.fastest is None:
             return None
@@ -139,9 +139,9 @@ class PlannedFlight:
 def plan_flight(
     source: Path | PathFile, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
 ) -> PlannedFlight:
-    """Plan a path file, or read a plan file and certify it anew. The certificate may fail: look at it.
+    """Plan a path file, or read a plan file and certify it again. The certificate may fail: check it.
 
-    With a correction, the plan of the file is shifted, slowed where that exceeds a limit, and gives way again.
+    With a correction, the plan of the file is shifted, slowed where it exceeds a limit, and gives way again.
 
     Raises:
         InputError: a file or an option is wrong.
@@ -188,14 +188,14 @@ def plan_flight(
 def give_way(
     planned: Plan, on_step: OnStep = ignore_steps, deadline: Deadline = NEVER
 ) -> tuple[Plan, SimulatedLinkLoss | None]:
-    """Return the plan, slower in places if link loss would take the vehicle outside the walls from there, or from a
-    stop from there, or a gap in setpoints or poses would lose it; and what link loss does to it.
+    """Return the plan, slower where link loss, in the plan or in a stop, would take the vehicle outside the walls, or
+    where a gap in setpoints or poses would lose it; and the simulated link loss.
 
-    Where safety.yaml says only to warn of link loss, nothing is slowed for that, and it is not looked at. After the
-    deadline plans are slowed more than they need be, which takes less time.
+    If safety.yaml says only to warn of link loss, it is neither simulated nor a reason to slow. After the deadline
+    plans are slowed more than necessary, which takes less time.
 
     Raises:
-        InfeasibleError: at some place the vehicle would end so however slowly it flies there.
+        InfeasibleError: at some place that happens at any speed.
     """
     limits = planned.limits
 
@@ -205,7 +205,7 @@ def give_way(
             return [assess_glitches(encoded, limits)]
         link_loss = assess_link_loss(encoded, limits)
         if not link_loss.passed or link_loss.simulated is None:
-            return [link_loss]  # which is mended first, and what else there is then looked at
+            return [link_loss]  # to be repaired before anything else is checked
         with ThreadPoolExecutor() as pool:
             stops = pool.submit(assess_link_loss_of_stops, encoded, limits, link_loss.simulated.moments)
             return [assess_glitches(encoded, limits), link_loss, stops.result()]
@@ -223,7 +223,7 @@ def give_way(
 
 
 def _corrected(planned: PlannedFlight, options: FlightOptions, on_step: OnStep) -> PlannedFlight:
-    """Return the plan that is asked of a vehicle which strays as the options' correction says. Raises as give_way()."""
+    """Return the plan with the correction of the options applied. Raises as give_way()."""
     assert options.correction is not None
     plan, before = planned.plan, planned.duration
     deadline = Deadline.after(default_budget(plan.path) if options.budget is None else options.budget)

@@ -32,7 +32,7 @@ from cfplan.simulation.link_loss import LinkLoss, link_loss_at_every_setpoint, s
 
 @dataclass(frozen=True, slots=True)
 class PreparedFlight:
-    """A mission that may fly, and everything that it was made from and checked by."""
+    """A certified mission, with its plan and checks."""
 
     planned: PlannedFlight
     encoded: EncodedFlight
@@ -62,7 +62,7 @@ def prepare_flight(
     encoded = encode_flight(planned, on_step, stream_for=options.stream_for)
     rehearsed = rehearse(planned, encoded, on_step)
     lost = find_link_loss(encoded, limits, on_step, planned.link_loss)
-    if planned.was_read:  # else planning made sure of it, by the same bytes
+    if planned.was_read:  # else planning has checked it, for the same bytes
         require_glitch_margin(encoded, limits, on_step)
         require_harmless_stops(encoded, limits, on_step)
     mission, stops = make_mission(encoded, limits, on_step)
@@ -71,7 +71,7 @@ def prepare_flight(
 
 
 def prepare_mission(source: Path, limits: Limits, options: FlightOptions | None = None) -> Mission:
-    """Plan, certify and encode a mission without rehearsing it or certifying its stops: for the virtual vehicle alone.
+    """Plan, certify and encode a mission without rehearsing it or certifying its stops: only for the virtual vehicle.
 
     Studies of faults fly such missions. Raises what planning and encoding raise.
     """
@@ -120,7 +120,7 @@ def find_link_loss(
     on_step: OnStep = ignore_steps,
     simulated: SimulatedLinkLoss | None = None,
 ) -> LinkLoss:
-    """Simulate that the pilot or the radio dies at every setpoint of the flight, and return the worst.
+    """Simulate the loss of pilot or radio at every setpoint of the flight, and return the worst case.
 
     If planning has `simulated` the same bytes under these limits, its result is used. Raises NotCertifiedError if the
     vehicle comes down outside the walls, unless safety.yaml says only to warn.
@@ -150,7 +150,7 @@ def require_glitch_margin(encoded: EncodedFlight, limits: Limits, on_step: OnSte
 def require_harmless_stops(encoded: EncodedFlight, limits: Limits, on_step: OnStep = ignore_steps) -> None:
     """Simulate link loss within sampled stops. Raises NotCertifiedError if one ends outside the walls.
 
-    Where safety.yaml says only to warn of link loss, it is not looked at.
+    Skipped if safety.yaml says only to warn of link loss.
     """
     if limits.link_loss.only_warn:
         return

@@ -1,11 +1,11 @@
-"""Link loss of slow motion: after each setpoint of take-off, of the way to the start and of landing, too, the vehicle
-must come down inside the walls.
+"""Link loss in slow motion: the vehicle must come down inside the walls also from take-off, the way to the start, and
+landing.
 
-Where it will stand before take-off is not known yet. The worst is a way straight towards a wall or away from one that
-is just so long that it takes the least time, as nothing else accelerates as much, and take-off beside two walls. So
-these are looked at: to the start from all sides so far away, from each wall and from each corner, and take-off there.
-Ways with an obstacle on them or beneath are left out, as preflight refuses these, and so are ways that begin close to
-an obstacle: between a wall and an obstacle, the vehicle leans away from each towards the other.
+The position before take-off is not known yet. The worst cases are a way straight towards a wall or away from one, of
+exactly the length that takes the shortest manoeuvre time, as it accelerates most, and a take-off beside two walls.
+Therefore ways of this length to the start from all sides, from each wall and from each corner are simulated, and
+take-offs there. Ways with an obstacle on or below them are left out, as preflight refuses these, and so are ways that
+begin close to an obstacle: between a wall and an obstacle the vehicle leans away from each towards the other.
 """
 
 from collections.abc import Iterator
@@ -31,20 +31,20 @@ from cfplan.simulation.link_loss import link_loss_of_slow_motion
 _TURN = np.pi / 2  # rad, of the vehicle on its way to the start
 _PLACES = 200  # on the way to the start, checked for obstacles
 _TAKE_OFF_CLEARANCE = 0.3  # m, beyond the margin, between obstacles and a take-off that is simulated
-_BENEATH_FLOOR = 0.3  # m that a landing's setpoints sink beneath the floor
+_BENEATH_FLOOR = 0.3  # m below the floor, where a landing's setpoints end
 _NETS = "in a room with nets, write `outside: warn` under `link_loss` in safety.yaml"
 _TAKE_OFF_HINT = f"lower `ground.take_off_speed`, or widen `space.margin`; {_NETS}"
 _START_HINT = f"lower `ground.go_to_speed`, or begin the path farther from there; {_NETS}"
 _LANDING_HINT = f"end the path farther from there; {_NETS}"
 
-_Motion = tuple[str, str, NDArray]  # what it is and from where, a hint, its payloads
+_Motion = tuple[str, str, NDArray]  # name, hint, payloads
 
 
 def require_harmless_slow_motion(mission: Mission, on_step: OnStep = ignore_steps) -> None:
     """Simulate link loss in take-off, on the way to the start, and in landing after the mission.
 
-    Raises NotCertifiedError where the vehicle comes down outside the walls, unless safety.yaml says only to warn, and
-    where the landing ends on an obstacle.
+    Raises NotCertifiedError if the vehicle comes down outside the walls, unless safety.yaml says only to warn, and if
+    the landing ends on an obstacle.
     """
     limits, farthest, worst = mission.limits, -np.inf, ""
     with step(on_step, "slow phases") as results:
@@ -69,7 +69,7 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
     low, high = np.add(space.low, space.margin), np.subtract(space.high, space.margin)
     sides = [(low[0], y), (high[0], y), (x, low[1]), (x, high[1])]
     corners = list(product((low[0], high[0]), (low[1], high[1])))
-    for side, other in corners[::3]:  # two, which face all walls
+    for side, other in corners[::3]:  # two of them face all walls
         if not _clear((side, other, height), (side, other, height), beside):
             continue
         begin, above = (float(side), float(other), space.low[2]), (float(side), float(other), height)
@@ -92,7 +92,7 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
 
 
 def _clear(begin: Triple, end: Triple, space: Space) -> bool:
-    """Return whether a way and the space beneath it are clear of obstacles; preflight refuses others."""
+    """Return whether a way and the space below it are clear of obstacles; preflight refuses others."""
     if not space.obstacles:
         return True
     way = np.linspace(begin, end, _PLACES)
@@ -100,7 +100,7 @@ def _clear(begin: Triple, end: Triple, space: Space) -> bool:
 
 
 def _require_clear_landing(mission: Mission) -> None:
-    """Raise NotCertifiedError where an obstacle stands beneath the end of the path."""
+    """Raise NotCertifiedError if an obstacle is below the end of the path."""
     space, (end, _) = mission.limits.space, mission.end
     if not _clear(end, end, space):
         (beyond,), (face,) = space.above_floor(np.array([end]))

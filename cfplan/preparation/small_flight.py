@@ -90,7 +90,7 @@ PARTS: Mapping[str, Callable[[Path, Limits], None]] = MappingProxyType(
 def fly(safety_file: Path, part: str) -> None:
     """Run a part of the small flight under these limits, in the middle of their space."""
     limits = load_limits(safety_file)
-    limits = replace(limits, space=replace(limits.space, obstacles=()))  # one may stand in the middle
+    limits = replace(limits, space=replace(limits.space, obstacles=()))  # the middle may be occupied
     middle = (np.array(limits.space.low) + limits.space.high) / 2
     with TemporaryDirectory() as folder:
         path_file = Path(folder, "small.yaml")

@@ -1,4 +1,4 @@
-"""The steps of preparing a flight, reported one by one to whoever shows or times them."""
+"""The steps of preparing a flight, reported one by one to a listener."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,24 +8,24 @@ from cfplan.errors import CfplanError
 
 
 class StepState(Enum):
-    """How far a step is."""
+    """The progress of a step."""
 
     BEGUN = "begun"
     FINISHED = "finished"
-    WARNED = "warned"  # finished, and a person should read the result
+    WARNED = "warned"  # finished, with a result that a person should read
     FAILED = "failed"
-    DETAIL = "detail"  # told after the end: what only some readers want to know
+    DETAIL = "detail"  # reported after the end, for verbose output
 
 
-OnStep = Callable[[str, StepState, str], None]  # name of the step, how far it is, its result in one line
+OnStep = Callable[[str, StepState, str], None]  # name of the step, its progress, its result in one line
 
 
 def ignore_steps(name: str, state: StepState, result: str) -> None:
-    """Show nothing."""
+    """Ignore all steps."""
 
 
 class StepResults(list[str]):
-    """What a step says at its end, whether that is a warning, and details that only some readers want."""
+    """Results of a step, whether they are a warning, and details for verbose output."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ class StepResults(list[str]):
 
 @contextmanager
 def step(on_step: OnStep, name: str) -> Iterator[StepResults]:
-    """Report the block as a step. What the block appends to the list is the step's result, joined by commas."""
+    """Report the block as a step. Its result is what the block appends to the list, joined by commas."""
     on_step(name, StepState.BEGUN, "")
     results = StepResults()
     try:

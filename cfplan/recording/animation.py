@@ -1,7 +1,7 @@
 """A recorded flight as a GIF: the room in perspective, the path in the colours of its limits, the vehicle, its speed.
 
-What stays is drawn once, and over it in each frame what moves. All frames have one palette, and a file holds what
-changes from frame to frame.
+The static background is drawn once, and in each frame the moving parts over it. All frames share one palette, and the
+file stores the differences between frames.
 """
 
 from io import BytesIO
@@ -70,12 +70,12 @@ def animate_flight(record: Record) -> list[Image.Image]:
 
 
 def check_animation_file(file: Path, *, overwrite: bool) -> None:
-    """Raise InputError where no animation can be written there."""
+    """Raise InputError if no animation can be written there."""
     check_new_file(file, SUFFIX, overwrite=overwrite)
 
 
 def save_animation(frames: list[Image.Image], file: Path, *, overwrite: bool = False) -> None:
-    """Write frames as a GIF that repeats, whole or not at all. Raises InputError where it cannot be written."""
+    """Write frames as a looping GIF, atomically. Raises InputError if it cannot be written."""
     check_animation_file(file, overwrite=overwrite)
     palette = frames[len(frames) // 2].quantize(_COLOURS, Image.Quantize.MAXCOVERAGE)
     few = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
@@ -85,7 +85,7 @@ def save_animation(frames: list[Image.Image], file: Path, *, overwrite: bool = F
 
 
 class _Scene:
-    """What stays the same from frame to frame, drawn once, and what moves."""
+    """The static background, drawn once, and the moving parts."""
 
     @mpl.rc_context(_STYLE)
     def __init__(self, record: Record, plan: Plan, begin: float):
@@ -94,7 +94,7 @@ class _Scene:
         figure = Figure(figsize=(WIDTH / _DPI, HEIGHT / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(figure)
         room, curve = _draw_still(figure, plan, record.header.name)
-        moving: dict[str, Any] = {"animated": True}  # left out where the canvas is drawn
+        moving: dict[str, Any] = {"animated": True}  # left out when the canvas is drawn
         self._track, self._tail, self._plumb, *self._vehicle = (
             room.plot([], [], [], color=colour, lw=width, **moving)[0]
             for colour, width in ((FLOWN, 0.6), (FLOWN, 1.2), ("0.6", 0.7), *((c, w) for _, c, w in _VEHICLE))
@@ -128,7 +128,7 @@ class _Scene:
 
 
 def _draw_still(figure: Figure, plan: Plan, name: str) -> tuple[Any, Axes]:
-    """Draw what does not move; return the axes of the room and of the speed."""
+    """Draw the static background; return the axes of the room and of the speed."""
     active = active_limits(plan)
     figure.text(0.02, 0.94, caption(plan, name), size=10, parse_math=False)
     limits = dict.fromkeys(str(name) for name in active.name if name != FREE)
@@ -155,7 +155,7 @@ def _draw_obstacle(room: Any, obstacle: Obstacle) -> None:
 
 
 def _draw_room(figure: Figure, space: Space) -> Any:
-    """Return three-dimensional axes that show the room, in one scale, as large as it goes into the view."""
+    """Return three-dimensional axes that show the room, with equal scales, as large as fits the view."""
     low, high = np.array(space.low), np.array(space.high)
     room: Any = figure.add_axes((0.0, 0.0, HEIGHT / WIDTH, 1.0), projection="3d")
     room.set_proj_type("persp", _FOCAL_LENGTH)

@@ -1,4 +1,4 @@
-"""What the pilot of a record was bound to fly: the setpoints of all plans committed in flight, in one sequence."""
+"""Commitments of a record: the setpoints of all plans committed in flight, in one sequence."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ _FARTHEST = 5_000_000  # number of a setpoint: 14 hours, more than a record's lo
 
 
 def check_commitments(commitments: Commitments, *, where: str) -> None:
-    """Raise InputError where these are no setpoints, or have no numbers that setpoints have."""
+    """Raise InputError if these are not setpoints, or their numbers are invalid."""
     for number, (splice, payloads) in enumerate(zip(commitments.splice, commitments.payloads, strict=True)):
         if not payloads or len(payloads) % PAYLOAD_SIZE or not 0 <= splice <= (_FARTHEST if number else 0):
             raise InputError(
@@ -23,7 +23,7 @@ def check_commitments(commitments: Commitments, *, where: str) -> None:
 
 
 def committed_setpoints(record: Record) -> NDArray:
-    """Return (N, 29) uint8, each setpoint as it was committed last; none where no plan was committed in flight."""
+    """Return (N, 29) uint8, each setpoint as committed last; none if no plan was committed in flight."""
     plans = [
         (int(splice), np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE))
         for splice, payloads in zip(record.commitments.splice, record.commitments.payloads, strict=True)
@@ -32,20 +32,20 @@ def committed_setpoints(record: Record) -> NDArray:
     sequence, length = np.empty((longest, PAYLOAD_SIZE), dtype=np.uint8), 0
     for splice, rows in plans:
         if length:
-            sequence[length:splice] = sequence[length - 1]  # it hovers at the end of what was held
+            sequence[length:splice] = sequence[length - 1]  # hover at the end of the earlier setpoints
         length = splice + len(rows)
         sequence[splice:length] = rows
     return sequence[:length]
 
 
 def committed_path(record: Record) -> NDArray:
-    """Return (M, 3) m, where the vehicle was to fly: the header's path, or what was committed in flight."""
+    """Return the planned path, (M, 3) m: the header's, or the one committed in flight."""
     sequence = committed_setpoints(record)
     return decode(sequence).position if len(sequence) else record.header.path
 
 
 def committed_time(record: Record) -> float:
-    """Return how long, s, the vehicle was to fly: the header's time, or until the last committed motion ended."""
+    """Return the planned duration, s: the header's, or until the end of the last committed motion."""
     sequence = committed_setpoints(record)
     if not len(sequence):
         return record.header.travel_time

@@ -1,4 +1,4 @@
-"""The header of a record: which flight it is, on what vehicle, under what limits; to JSON and back."""
+"""The header of a record: flight, vehicle and limits; to JSON and back."""
 
 import json
 import math
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 Triple = tuple[float, float, float]
 
-PROMISED_LATENESS = 2e-3  # s, of all setpoints but one in a hundred
+PROMISED_LATENESS = 2e-3  # s, of 99 % of the setpoints
 FINGERPRINT, FLOWN = "path file's fingerprint", "flown"  # keys of the provenance
 _PATH_SAMPLES = 500  # of the drawn path
 _NO_SHIFT = np.empty((0, 3))
@@ -32,7 +32,7 @@ _NO_SHIFT = np.empty((0, 3))
 
 @dataclass(frozen=True, slots=True)
 class FlightBounds:
-    """Limits by which a flight is judged, drawn as lines in the plots; NaN where there is none."""
+    """Limits by which a flight is judged, drawn as lines in the plots; NaN if there is none."""
 
     speed: float = math.nan  # m/s
     acceleration: float = math.nan  # m/s², gravity not counted
@@ -48,7 +48,7 @@ _NO_BOUNDS = FlightBounds()
 
 @dataclass(frozen=True, slots=True)
 class RecordHeader:
-    """Known before take-off; enough to draw and judge the flight without any other file."""
+    """Data known before take-off, enough to draw and judge the flight without any other file."""
 
     name: str
     version: str  # of cfplan
@@ -66,7 +66,7 @@ class RecordHeader:
     """Where the plan came from: file, model hash, …"""
     obstacles: tuple[Obstacle, ...] = ()
     shift: NDArray = field(default_factory=_NO_SHIFT.copy)
-    """(N, 3) m, by how much earlier flights corrected setpoints 0 … of the plan; empty where none did."""
+    """(N, 3) m, correction of setpoints 0 … of the plan by earlier flights; empty if there is none."""
 
 
 def header_under(
@@ -103,9 +103,9 @@ def header_under(
 def header_of_steering(
     limits: Limits, *, name: str, uri: str, place: Triple, yaw: float, wall_time_at_zero: float
 ) -> RecordHeader:
-    """Return the header of a flight whose path is yet to be asked for; it begins in hover at a place, m, and yaw, rad.
+    """Return the header of a flight without a path yet, which begins in hover at a position, m, and yaw, rad.
 
-    Both are kept to the last digit: `cfplan check` simulates the flight again from there.
+    Both are stored exactly, as `cfplan check` simulates the flight again from there.
     """
     return header_under(
         limits,
@@ -137,8 +137,7 @@ def header_of_plan(
 ) -> RecordHeader:
     """Return the header of the flight of a plan that was made from a path file, or read from a plan file.
 
-    `uncorrected` is the plan where the vehicle is wanted, if what it is asked to fly is corrected. Raises
-    InputError where the path file cannot be read.
+    `uncorrected` is the plan before its correction, if there is one. Raises InputError if the path file cannot be read.
     """
     limits, wanted = plan.limits, uncorrected or plan
     header = header_under(
@@ -160,7 +159,7 @@ def header_of_plan(
 
 
 def _fingerprint(source: FilePath) -> dict[str, str]:
-    """Return that of a path file; nothing of a plan file, which holds its motion itself, and where there is no file."""
+    """Return the fingerprint of a path file; nothing for a plan file, or without a file."""
     return {} if source.suffix == ".parquet" or not source.is_file() else {FINGERPRINT: fingerprint(source)}
 
 
@@ -170,9 +169,9 @@ def header_to_json(header: RecordHeader) -> str:
 
 
 def header_from_json(text: str, *, where: str = "") -> RecordHeader:
-    """Read a header. Raises InputError where a key is missing or of the wrong kind.
+    """Read a header. Raises InputError if a key is missing or of the wrong kind.
 
-    Records outlive versions: keys of later ones are ignored, limits that earlier ones lacked are NaN.
+    Records outlive versions: unknown keys are ignored, missing limits are NaN.
     """
     try:
         values = replace_surrogates(json.loads(text))

@@ -1,4 +1,4 @@
-"""Lay flights over one another and over a plan: each is a trial, with time 0 where the path begins."""
+"""Overlay flights with one another and with a plan: each is a trial, with time 0 at the beginning of the path."""
 
 import math
 import re
@@ -18,17 +18,17 @@ from cfplan.recording.record import Record
 from cfplan.recording.summary import planned_positions, reference_span, reference_times
 from cfplan.vehicle.trajectory import Trajectory
 
-STEP = 0.01  # s, of the grid on which time is first looked for
-NEARBY = 0.2  # s, around what the grid says, where time is looked for closely
+STEP = 0.01  # s, grid of the first search for the time offset
+NEARBY = 0.2  # s, range of the fine search around the first result
 SPEED_SPAN = 0.025  # s, before and after
-_LONGEST_GAP = 0.1  # s between poses, over which a straight line still approximates where the vehicle was
-_SHORTEST_STEP = 1e-5  # s between poses, that anything measures
-_MAX_UNEXPLAINED = 0.5  # of the plan's own variance: where more is left, log and plan hardly are the same flight
+_LONGEST_GAP = 0.1  # s between poses, longest gap bridged by a straight line
+_SHORTEST_STEP = 1e-5  # s, shortest measurable interval between poses
+_MAX_UNEXPLAINED = 0.5  # of the plan's variance; with more left, log and plan are hardly the same flight
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """Where a vehicle should have been."""
+    """The reference motion of a vehicle."""
 
     name: str
     time: NDArray  # (M,) s from the start of the path
@@ -49,7 +49,7 @@ class Trial:
     position: NDArray  # (N, 3) m, NaN where it was not seen
     quaternion: NDArray  # (N, 4) body→world, x y z w, NaN where not known
     reference: Reference | None
-    room: tuple[Triple, Triple] | None = None  # m, lower and upper corner; a log knows of none
+    room: tuple[Triple, Triple] | None = None  # m, lower and upper corner; None for a log
 
     @property
     def deviation(self) -> NDArray:
@@ -73,10 +73,10 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How a log was laid over a plan: moved in time, in space as given."""
+    """Alignment of a log with a plan: shifted in time, not in space."""
 
     offset: float  # s of the log's clock at which the plan begins
-    covered: float  # share of the plan's time in which the subject was seen
+    covered: float  # fraction of the plan's time in which the subject was seen
     aside: tuple[float, float, float]  # m, mean of the log minus the plan
     max_deviation: float  # m
     rms_deviation: float  # m
@@ -128,12 +128,11 @@ def trial_of_subject(subject: LoggedSubject, reference: Reference | None = None,
 def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     """Find by correlation where in the log the plan was flown.
 
-    It is the time at which the difference of log and plan varies least, so that neither a shift of the
-    laboratory's origin nor what was flown before and after matters. A part of the plan that was not seen counts as if
-    it had been missed by the plan's own spread. A vehicle that lags behind its setpoints by a constant time is moved
-    by that too: a log alone cannot distinguish the two.
+    At this time the difference of log and plan has the least variance, so neither the laboratory's origin nor motion
+    before and after matters. Parts of the plan that were not seen count with the plan's own variance. A constant delay
+    of the vehicle is compensated too: a log alone cannot distinguish the two.
 
-    Raises InputError where the subject was hardly seen.
+    Raises InputError if the subject was hardly seen.
     """
     time, position = subject.time[subject.seen], subject.position[subject.seen]
     if len(time) < 2 or time[-1] - time[0] < 2 * STEP:

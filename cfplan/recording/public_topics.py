@@ -60,7 +60,7 @@ class PublicTopics:
 
 
 def _topics_of(message: telemetry.Telemetry) -> Iterator[tuple[str, Any]]:
-    """Return what a message tells by public schemas, without time stamps. What is not finite tells nothing."""
+    """Return a message in public schemas, without time stamps; nothing for values that are not finite."""
     match message:
         case telemetry.PoseReceived() | telemetry.SetpointSent():
             if _finite(message):

@@ -1,7 +1,7 @@
-"""Write a record's MCAP file while the flight goes on, without ever holding the flight up.
+"""Write a record's MCAP file while the flight goes on, without ever delaying the flight.
 
-`write` only puts a message into a queue. Four times a second a thread writes the queued messages as one chunk, so that
-a process killed at any moment leaves all but its last instant behind.
+`write` only puts a message into a queue. Four times a second a thread writes the queued messages as one chunk, so
+a killed process loses only the last moments.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from cfplan.recording.public_topics import PublicTopics
 from cfplan.recording.record import FLIGHT_FILE, SUMMARY_FILE
 from cfplan.recording.topics import FORMAT, METADATA, PROFILE, TOPICS, json_schema, message_to_json
 
-FLUSH_PERIOD = 0.25  # s, the most that a killed process loses, but for the time that writing takes
+FLUSH_PERIOD = 0.25  # s, largest loss if the process is killed, plus the time for writing
 _LOG = logging.getLogger(__name__)
 
 
@@ -50,7 +50,7 @@ def wall_time_at_zero() -> float:
 
 
 def new_record_folder(root: Path, name: str, *, now: datetime | None = None) -> Path:
-    """Make `root/<stamp>-<name>`, numbered where that is taken. Raises InputError where it cannot be made."""
+    """Make `root/<stamp>-<name>`, numbered if that exists. Raises InputError if it cannot be made."""
     stamp = (now or datetime.now()).strftime("%Y%m%d-%H%M%S")
     plain = re.sub(r"[^A-Za-z0-9_-]+", "-", name).strip("-")[:60] or "flight"
     folder, number = root / f"{stamp}-{plain}", 1
@@ -70,7 +70,7 @@ def new_record_folder(root: Path, name: str, *, now: datetime | None = None) -> 
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any]) -> None:
-    """Write summary.json, whole or not at all. Raises OSError, or ValueError where a number is not finite."""
+    """Write summary.json atomically. Raises OSError, or ValueError if a number is not finite."""
     text = json.dumps(dict(summary), indent=2, allow_nan=False)
     with atomic_write(folder / SUMMARY_FILE) as unfinished:
         unfinished.write_text(text + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What is allowed: limits from safety.yaml, the space, the certificate, and slowing until it passes."""
+"""Safety: limits from safety.yaml, the space, the certificate, and slowing until it passes."""
 
 __all__ = [
     "certificate",

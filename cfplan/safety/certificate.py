@@ -1,11 +1,11 @@
-"""The certificate: that no limit is exceeded anywhere on a trajectory, between samples included.
+"""Certificate: no limit is exceeded anywhere on a trajectory, between samples included.
 
-The trajectory is cut at the grid points of its profile and at the breaks of its path, so that every piece is smooth,
-and each piece is sampled from end to end, closed: at least ten points, and never further apart than a millisecond of
-flight. Both sides of a grid point are thus seen, where h''' and ψ'' jump. Between two samples a smooth quantity exceeds
-the larger of them by at most an eighth of its second difference there; that is added, twice over, to every worst value.
-Where so much is added that a limit's margin would be overstated, samples are taken four times as near, and again. The
-distance to obstacles is that of the path: see space.py.
+The trajectory is cut at the grid points of its profile and at the breaks of its path, so that every piece is smooth.
+Each piece is sampled, including both ends, at no less than ten points and at most a millisecond of flight apart, so
+both sides of a grid point are checked, where h''' and ψ'' jump. Between two samples a smooth quantity exceeds both by
+at most an eighth of its second difference; twice that is added to every worst value as an allowance. If the allowance
+is so large that usage would be overstated, the sample spacing is divided by four, up to twice. The distance to
+obstacles is that of the path, see space.py.
 """
 
 import math
@@ -33,32 +33,32 @@ from cfplan.vehicle.motion import fill
 from cfplan.vehicle.profile import h_within
 from cfplan.vehicle.trajectory import Trajectory
 
-TIME_STEP = 1e-3  # s, the most between two samples
-BATCH = 1_000  # samples at a time, about: as many as stay near the processor
-BLOCK = 512  # samples searched for a peak at once
-LEAST_POINTS = 11  # of a piece, its ends included
+TIME_STEP = 1e-3  # s, largest sample spacing
+BATCH = 1_000  # samples at a time, about: as many as fit the cache
+BLOCK = 512  # samples per search for a peak
+LEAST_POINTS = 11  # of a piece, including its ends
 WALLS, OBSTACLES = "distance to the walls", "distance to obstacles"
-OF_PLACE = (WALLS, OBSTACLES)  # decided by the path alone, at any speed
-CAPPED_SPEED = "speed, capped"  # against the caps along the path, where there are any
-POSITION = MEASURES  # row of what is searched, behind the measures: m, and the two rows behind
+OF_PLACE = (WALLS, OBSTACLES)  # depend only on the path, not on speed
+CAPPED_SPEED = "speed, capped"  # against the caps along the path, if there are any
+POSITION = MEASURES  # row after the measures, with two more: position, m
 _ALLOWANCE = 2.0 / 8.0  # of the second difference
-MAX_ALLOWANCE = 0.01  # share of a limit: with more than that for what lies between samples, they are taken nearer
+MAX_ALLOWANCE = 0.01  # fraction of a limit; with a larger allowance the spacing is refined
 REFINE_FACTOR, MAX_REFINEMENTS = (
     4,
     2,
-)  # so many times as near, so often: past that the flight is so rough that it fails in any case
-_SAME = 1e-12  # share of a path's length in s, nearer than which two places are one
+)  # a flight that needs more refinement fails anyway
+_SAME = 1e-12  # fraction of a path's length in s, within which two places are the same
 
 
 @dataclass(frozen=True, slots=True)
 class Margin:
-    """How near the trajectory comes to one limit at its worst moment."""
+    """The margin of one limit at the worst moment of the trajectory."""
 
     name: str
     unit: str
-    worst: float  # with the allowance for what lies between samples
+    worst: float  # including the allowance between samples
     limit: float
-    share: float  # of the limit; for a least thrust, of the way from hover down to it; NaN where a value is not finite
+    share: float  # usage of the limit; for a least thrust, from hover down to it; NaN if a value is not finite
     time: float  # s
     s: float
     position: tuple[float, float, float]  # m
@@ -77,7 +77,7 @@ class Margin:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """Every limit with its margin. It holds for this trajectory and these limits alone."""
+    """Every limit with its margin, for one trajectory and one set of limits."""
 
     margins: tuple[Margin, ...]
     duration: float  # s
@@ -90,11 +90,11 @@ class Certificate:
 
     @property
     def worst(self) -> Margin:
-        """Return the margin with the largest share; one that is not a number before all others."""
+        """Return the margin with the largest usage; NaN comes first."""
         return max(self.margins, key=lambda margin: np.inf if np.isnan(margin.share) else margin.share)
 
     def rows(self) -> list[tuple[str, str, str, str, str, str]]:
-        """Return rows of a table: limit, worst value with its unit, allowed, share, time, place in m."""
+        """Return rows of a table: limit, worst value with its unit, allowed value, usage, time, position in m."""
         return [
             (
                 margin.name,
@@ -108,7 +108,7 @@ class Certificate:
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what JSON takes; numbers that are not finite become None."""
+        """Return a document for JSON; numbers that are not finite become None."""
         return {
             "passed": self.passed,
             "duration": self.duration,
@@ -121,7 +121,7 @@ class Certificate:
 
 
 class Segments(NamedTuple):
-    """Parts of a flight on which everything is smooth, (K,) each, and how many samples are taken of each."""
+    """Smooth parts of a flight, (K,) each, and the number of samples of each."""
 
     left: NDArray  # s
     right: NDArray  # s
@@ -131,7 +131,7 @@ class Segments(NamedTuple):
 
 
 class _Bound(NamedTuple):
-    """A quantity and its limit; `unused` is the value that counts as share 0."""
+    """A quantity and its limit; `unused` is the value of usage 0."""
 
     quantity: Quantity
     limit: float
@@ -141,7 +141,7 @@ class _Bound(NamedTuple):
 def certify(
     trajectory: Trajectory, limits: PlanLimits, space: Space | None = None, caps: SpeedCaps | None = None
 ) -> Certificate:
-    """Check every limit everywhere; space and speed caps too, where given. Never raises: what is not a number fails."""
+    """Check every limit everywhere, also space and speed caps if given. Never raises: NaN fails."""
     segments, (bounds, table) = segments_of(trajectory), _bounds(trajectory.airframe, limits, space)
     walls = np.zeros((2, 0)) if space is None else np.array([space.low, space.high])
     path, body, nodes = trajectory.path, compiled_body(trajectory.airframe), trajectory.timing.nodes
@@ -166,7 +166,7 @@ def certify(
 
 
 def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[str, NDArray]:
-    """Return the share of each limit at each time, (N,) each; counted as in the certificate, without the walls."""
+    """Return the usage of each limit at each time, (N,) each, as in the certificate, without the walls."""
     state = trajectory.at(time)
     measured = measures_of(
         state.velocity, state.acceleration, state.body_rate, state.thrust_axis, state.specific_thrust,
@@ -178,10 +178,10 @@ def shares(trajectory: Trajectory, limits: PlanLimits, time: NDArray) -> dict[st
 
 @lru_cache(maxsize=16)
 def _bounds(airframe: Airframe, limits: PlanLimits, space: Space | None) -> tuple[tuple[_Bound, ...], NDArray]:
-    """Return the limits that bind; and for compiled code, (Q, 3), the first row of each, how many, and its side."""
+    """Return the finite limits; and for compiled code, (Q, 3): first row, number of rows and side of each."""
     bounds = [_Bound(q, q.allowed(limits), q.unused(airframe)) for q in QUANTITIES if q.allowed(limits) != math.inf]
     if space is not None:
-        walls = Quantity(WALLS, "m", "", "", AT_LEAST, POSITION, 3)  # in place of the position itself
+        walls = Quantity(WALLS, "m", "", "", AT_LEAST, POSITION, 3)  # replaces the position itself
         bounds.append(_Bound(walls, space.margin, half_of(space)))
     return tuple(bounds), np.array([(q.measure, q.count, q.side) for q, _, _ in bounds])
 
@@ -191,7 +191,7 @@ def _plain(value: Any) -> Any:
 
 
 def _overstated(bound: _Bound, peak: float, added: float) -> bool:
-    """Return whether what was added to a peak is much beside the limit; False where that is not a number."""
+    """Return whether the allowance of a peak is large relative to the limit; False for NaN."""
     quantity, limit, unused = bound
     sampled, worst = (float(quantity.value(quantity.side * value)) for value in (peak - added, peak))
     return abs(worst - sampled) > MAX_ALLOWANCE * (abs(limit) or abs(unused))
@@ -223,7 +223,7 @@ def share_of(quantity: Quantity, worst: float, limit: float, unused: float) -> f
 
 
 def half_of(space: Space) -> float:
-    """Return the distance from walls and obstacles, m, that counts as usage 0: half the room's least size."""
+    """Return the distance from walls and obstacles, m, of usage 0: half the room's least size."""
     return float(np.subtract(space.high, space.low).min()) / 2
 
 
@@ -237,9 +237,9 @@ def obstacle_margin(path: Path, space: Space, time_at: Callable[[NDArray], Any])
 
 
 def _capped_speed(trajectory: Trajectory, caps: SpeedCaps, segments: Segments) -> Margin:
-    """Return the margin of speed against caps, sampled as the rest is, and also where caps bend and half-way between.
+    """Return the margin of speed against caps, sampled like other limits, and at the caps' corners and half-way.
 
-    A place where they bend is an end, so no allowance is made across it.
+    A corner is the end of a segment, so no allowance spans it.
     """
     steps = np.repeat((segments.right - segments.left) / (segments.counts - 1), segments.counts)
     number = np.arange(len(steps)) - np.repeat(np.cumsum(segments.counts) - segments.counts, segments.counts)
@@ -276,7 +276,7 @@ def segments_of(trajectory: Trajectory) -> Segments:
 def _cut(
     s: NDArray, intervals: NDArray, nodes: NDArray, breaks: NDArray
 ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Return what `segments_of` does, of the timing's pieces, which end at `s`, and its profile's table."""
+    """Return the result of `segments_of` from the timing's pieces, which end at `s`, and its profile's table."""
     every, here, there = np.empty(len(s) + len(breaks)), 0, 0  # both in order
     for n in range(len(every)):
         if there == len(breaks) or (here < len(s) and s[here] <= breaks[there]):
@@ -316,7 +316,7 @@ def _search(
     table: NDArray, walls: NDArray, batch: int, body: Body, origins: NDArray, coefficients: NDArray, nodes: NDArray,
     segments: Segments,
 ) -> tuple[NDArray, NDArray, NDArray]:  # fmt: skip
-    """Return the peak of each of the table's quantities, what of it was added to the samples, and s there.
+    """Return the peak of each of the table's quantities, the allowance in it, and s there.
 
     Takes about `batch` samples at a time.
     """
@@ -330,7 +330,7 @@ def _search(
         s, piece, interval = sampled(segments, begin, end)
         curve, rows = derivatives_on(origins, coefficients, s, piece), np.empty((MEASURES + walls.shape[1], samples))
         fill(rows[:MEASURES], body, curve, nodes, s, interval)
-        for axis in range(walls.shape[1]):  # how far from the walls positions are
+        for axis in range(walls.shape[1]):  # distances of positions from the walls
             middle, half = (walls[0, axis] + walls[1, axis]) / 2, (walls[1, axis] - walls[0, axis]) / 2
             rows[POSITION + axis] = half - np.abs(curve[0, axis] - middle)
         raise_peaks(values, added, places, table, rows, s, counts[begin:end])
@@ -360,7 +360,7 @@ def raise_peaks(
 ) -> None:
     """Update the running maxima with this batch. `table`, (Q, 3): first row, how many, and side.
 
-    Segments have `counts` samples each, at least three, one segment behind the other.
+    Segments have `counts` samples each, at least three, one segment after the other.
     """
     total = 0
     for n in range(len(counts)):
@@ -386,13 +386,13 @@ def raise_peaks(
 
 @njit
 def _peak(row: NDArray, sign: int, lift: NDArray, peak: float) -> tuple[int, float]:
-    """Return the index of the largest of `sign` times (N,), and that with the allowance for what lies between samples.
+    """Return the index of the largest of `sign` times (N,), and its value with the allowance between samples.
 
-    Where that exceeds `peak`; else -1, and `peak`. NaN is larger than everything.
+    If that does not exceed `peak`, return -1 and `peak`. NaN is larger than everything.
     """
-    # Each inner sample answers for both gaps beside it, so all gaps of a segment are covered.
+    # Each inner sample covers both gaps beside it, so all gaps of a segment are covered.
     before, here, after, lift = row[:-2], row[1:-1], row[2:], lift[1:-1]
-    index, higher = -1, 0  # counted first, which takes several samples at once; a search is seldom needed
+    index, higher = -1, 0  # counting is vectorised; the search is seldom needed
     for n in range(len(here)):
         higher += not _bound(sign * before[n], sign * here[n], sign * after[n]) <= peak + lift[n]
     if higher:

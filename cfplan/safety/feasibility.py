@@ -1,4 +1,4 @@
-"""Feasibility before any search: whether hovering keeps the limits and what it spares; boundary states beyond them."""
+"""Feasibility checks before any search: hover within the limits, its thrust reserve, and boundary states."""
 
 import math
 from functools import lru_cache
@@ -11,12 +11,12 @@ from cfplan.vehicle.flatness import flat_state
 from cfplan.vehicle.measures import measures
 from cfplan.vehicle.profile import BoundaryState
 
-LEAST_SPARE = 1e-3  # N, what motors are taken to spare at least, so that no estimate divides by zero
-BOUNDARY_TOLERANCE = 1e-3  # share by which a boundary state may exceed a limit: what its own planner rounds
+LEAST_SPARE = 1e-3  # N, least assumed thrust reserve, so that no estimate divides by zero
+BOUNDARY_TOLERANCE = 1e-3  # relative tolerance of a boundary state: rounding of the planner that made it
 
 
 def hover_violation(airframe: Airframe, limits: PlanLimits) -> Quantity | None:
-    """Return the first quantity whose limit hovering does not keep with room to spare; None where it keeps all."""
+    """Return the first quantity whose limit hovering does not keep with some reserve; None if it keeps all."""
     for quantity in QUANTITIES:
         if quantity.excess(quantity.hover(airframe), quantity.allowed(limits)) >= 0.0:
             return quantity
@@ -24,7 +24,7 @@ def hover_violation(airframe: Airframe, limits: PlanLimits) -> Quantity | None:
 
 
 def describe_hover(quantity: Quantity, airframe: Airframe, limits: PlanLimits) -> str:
-    """Return what hovering takes and what the limit allows."""
+    """Describe the value in hover and the limit."""
     side = "at most" if quantity.side == AT_MOST else "at least"
     return (
         f"hovering takes a {quantity.noun} of {quantity.hover(airframe):.3g} {quantity.unit}, {quantity.limit} asks "
@@ -33,12 +33,12 @@ def describe_hover(quantity: Quantity, airframe: Airframe, limits: PlanLimits) -
 
 
 def spare_thrust(airframe: Airframe, limits: PlanLimits) -> tuple[float, float]:
-    """Return what each motor may add to its thrust in hover, and what it may take from it, N."""
+    """Return how much each motor may increase and decrease its thrust from hover, N."""
     return limits.motor_thrust_max - airframe.hover_thrust, airframe.hover_thrust - limits.motor_thrust_min
 
 
 def spare_turning(airframe: Airframe, limits: PlanLimits) -> float:
-    """Return the angular acceleration about roll or pitch, rad/s², that motors give with what they spare in hover."""
+    """Return the angular acceleration about roll or pitch, rad/s², of the motors' reserve in hover."""
     spare = max(min(spare_thrust(airframe, limits)), LEAST_SPARE)
     return 4 * airframe.arm * spare / max(airframe.inertia[:2])
 
@@ -47,7 +47,7 @@ def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
     """Return half the width, s, of the window that turns a jump of acceleration to its opposite into feasible motion.
 
     Over w a jump of 2a makes a jerk of 2a/w and a snap of at most 4a/w², and g times the thrust axis's first and second
-    derivative are about that: to be met by body rate, and by the torque that motors have to spare in hover.
+    derivative are about that: they must be met by body rate, and by the torque reserve of the motors in hover.
     """
     turning = min(spare_turning(airframe, limits), limits.angular_acceleration)
     most = min(limits.acceleration, 4 * limits.motor_thrust_max / airframe.mass)
@@ -57,7 +57,7 @@ def smoothing_half_width(airframe: Airframe, limits: PlanLimits) -> float:
 
 @lru_cache(maxsize=64)
 def infeasible_limit(airframe: Airframe, limits: PlanLimits) -> str:
-    """Return which limit excludes every flight because it excludes hovering; empty where none does."""
+    """Return which limit excludes hovering, and so every flight; empty if none does."""
     for name in PlanLimits.__slots__:
         value = getattr(limits, name)
         unbounded = name == "angular_acceleration" and value == math.inf
@@ -68,7 +68,7 @@ def infeasible_limit(airframe: Airframe, limits: PlanLimits) -> str:
 
 
 def violated_limit(boundary: BoundaryState, path: Path, s: float, airframe: Airframe, limits: PlanLimits) -> str:
-    """Return which limit a boundary state violates by itself, whatever follows; empty where it keeps all."""
+    """Return which limit a boundary state itself violates; empty if none."""
     if boundary.h <= 0:
         return f"h must be positive, not {boundary.h:g}"
     first, second, third, fourth = (path(s, order).tolist() for order in (1, 2, 3, 4))

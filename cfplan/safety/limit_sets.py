@@ -11,14 +11,14 @@ from cfplan.vehicle.airframes import AIRFRAMES
 
 @dataclass(frozen=True, slots=True)
 class LimitSet:
-    """A vehicle and what its planned motion may reach."""
+    """A vehicle and limits of its planned motion."""
 
     name: str
     airframe: Airframe
     limits: PlanLimits
 
 
-MOTOR_RESERVE = 0.2  # share of a motor's range that a plan for hardware leaves to feedback at either end
+MOTOR_RESERVE = 0.2  # fraction of a motor's range that plans for hardware leave to feedback at either end
 _FLOWN, _SIMULATED = AIRFRAMES["crazyflie-2.1+"], AIRFRAMES["crazyflie-2.0"]
 
 
@@ -72,6 +72,6 @@ PAPER = LimitSet(
         motor_thrust_max=_SIMULATED.motor_thrust_max,
     ),
 )
-DATA_SETS = MappingProxyType({**LIMIT_SETS, PAPER.name: PAPER})  # that datasets may be made with
-# m, where random waypoints are drawn: the paper's motion capture room and its training box.
+DATA_SETS = MappingProxyType({**LIMIT_SETS, PAPER.name: PAPER})  # available for datasets
+# m, boxes for random waypoints: the paper's motion capture room and its training box.
 BOXES = MappingProxyType({"4.5x8x2": (4.5, 8.0, 2.0), "10x10x10": (10.0, 10.0, 10.0)})

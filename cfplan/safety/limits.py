@@ -13,20 +13,20 @@ STOP_TILT = math.radians(
 
 @dataclass(frozen=True, slots=True)
 class PlanLimits:
-    """Limits of planned motion, everywhere on the path; all positive. quantities.py says how each is computed."""
+    """Limits of planned motion, everywhere on the path; all positive. quantities.py defines how each is computed."""
 
     speed: float  # m/s, norm
     acceleration: float  # m/s², norm, gravity not counted
     angular_velocity: float  # rad/s, norm of the body rates
     tilt: float  # rad, between the thrust axis and the vertical
     motor_thrust_min: float  # N, each motor
-    motor_thrust_max: float  # N, each motor, the reserve for feedback taken off
+    motor_thrust_max: float  # N, each motor, less the reserve for feedback
     specific_thrust_min: float  # m/s², collective thrust over mass
     angular_acceleration: float = math.inf  # rad/s², norm: motors take a tenth of a second to follow
 
 
 def within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
-    """Return limits of motor thrust that leave `reserve`, a share of the motors' range, to feedback at both ends."""
+    """Return limits of motor thrust that leave `reserve`, a fraction of the motors' range, to feedback at both ends."""
     least, most = airframe.thrust_range
     room = reserve * (most - least)
     return {"motor_thrust_min": least + room, "motor_thrust_max": most - room}
@@ -34,7 +34,7 @@ def within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True)
 class Ladder:
-    """Measured values above which the pilot brakes to a hover, lands, cuts the motors."""
+    """Measured values above which the pilot brakes to a hover, lands, or cuts the motors."""
 
     brake: float
     land: float
@@ -45,37 +45,37 @@ class Ladder:
 class FlightLimits:
     """Limits of measured motion."""
 
-    deviation: Ladder  # m, from where the setpoint is
-    fence: Ladder  # m, beyond the space less its margin; the floor is no fence
+    deviation: Ladder  # m, from the setpoint
+    fence: Ladder  # m, beyond the space less its margin; the floor does not count
     speed: Ladder  # m/s
     acceleration: Ladder  # m/s², gravity not counted
     angular_velocity: Ladder  # rad/s
-    patience: float  # s, for which speed, acceleration and angular velocity must last before they count
-    stop_tilt: float = STOP_TILT  # rad, that braking may reach where a turn is flown at the plan's limit
+    patience: float  # s that an excess of speed, acceleration or angular velocity must last to count
+    stop_tilt: float = STOP_TILT  # rad, in stops, where braking adds to a turn at the plan's limit
 
 
 @dataclass(frozen=True, slots=True)
 class BatteryLimits:
-    """Limits of the battery, which must last from take-off to landing."""
+    """Limits of the battery."""
 
-    at_rest: float  # V, least before take-off
-    under_load: float  # V, land below
-    under_load_seconds: float  # s, over which the loaded voltage is averaged
+    at_rest: float  # V, at least, before take-off
+    under_load: float  # V; below it the vehicle lands
+    under_load_seconds: float  # s, averaging time of the loaded voltage
     endurance: float  # s in the air
 
 
 @dataclass(frozen=True, slots=True)
 class PoseLimits:
-    """What motion capture must deliver."""
+    """Requirements on motion capture."""
 
     rate: float  # Hz, expected
     rate_min: float  # Hz, least before take-off
-    latency: float  # s, from the camera to this computer, by which poses are dated back
+    latency: float  # s, from the camera to this computer
     age_warning: float  # s
     age_brake: float  # s
     age_land: float  # s
-    jump: float  # m, between a pose and where the last ones led, at most
-    agreement: float  # m, between pose and the vehicle's own estimate, at most
+    jump: float  # m, largest distance of a pose from the extrapolated position
+    agreement: float  # m, largest distance between pose and the vehicle's own estimate
     yaw_agreement: float  # rad
     position_noise: float = 0.001  # m, standard deviation along each axis
     attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
@@ -83,12 +83,12 @@ class PoseLimits:
 
 @dataclass(frozen=True, slots=True)
 class LinkLossLimits:
-    """Where the vehicle may come down by itself after its last setpoint, should the pilot or the radio die."""
+    """Assumptions about link loss: where the vehicle comes down by itself after its last setpoint."""
 
     motor_lags: tuple[float, ...] = (0.07, 0.105, 0.13)  # s, with which this is simulated besides the airframe's own
-    attitude_error: float = math.radians(1.0)  # by which the vehicle has its attitude wrong, to any side
-    vertical_acceleration_error: float = 0.08  # m/s², that its accelerometer says too little or too much
-    velocity_error: float = 0.1  # m/s, by which it has its velocity wrong, to any side, when the link is lost
+    attitude_error: float = math.radians(1.0)  # error of the estimated attitude, in any direction
+    vertical_acceleration_error: float = 0.08  # m/s², error of the accelerometer, either sign
+    velocity_error: float = 0.1  # m/s, error of the estimated velocity at link loss, in any direction
     only_warn: bool = (
         False  # of a flight after which that is outside the walls, for rooms with nets; else it is refused
     )
@@ -100,11 +100,11 @@ class FirmwareSettings:
 
     controller: int  # stabilizer.controller
     estimator: int  # stabilizer.estimator
-    oldest: tuple[int, ...]  # the oldest firmware that may fly
-    newest: tuple[int, ...] = ()  # the newest firmware that may fly; older plan files name none
+    oldest: tuple[int, ...]  # oldest permitted firmware
+    newest: tuple[int, ...] = ()  # newest permitted firmware; older plan files have none
     watchdog: bool = True
-    """Whether motors stop 1 s after the pilot's last sign of life; it locks then, also after landing, and the pilot
-    restarts the vehicle there."""
+    """Whether the watchdog is used: motors stop 1 s after the last keep-alive packet, and the vehicle locks, also after
+    landing, where the pilot restarts it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +119,7 @@ class GroundManoeuvres:
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Everything of safety.yaml."""
+    """All of safety.yaml."""
 
     vehicle: str
     airframe: Airframe
@@ -131,4 +131,4 @@ class Limits:
     firmware: FirmwareSettings
     ground: GroundManoeuvres
     link_loss: LinkLossLimits = LinkLossLimits()
-    lateness: float = 0.005  # s, by which this computer may miss its deadlines before take-off, 99th percentile
+    lateness: float = 0.005  # s, 99th percentile of this computer's lateness before take-off

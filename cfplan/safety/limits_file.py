@@ -1,4 +1,4 @@
-"""safety.yaml, read strictly: every mistake is named with its line and column."""
+"""safety.yaml, read strictly: every error has its line and column."""
 
 import math
 from collections.abc import Callable
@@ -31,8 +31,8 @@ from cfplan.safety.space import SIDES, Box, Cylinder, Space, inside
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
-DEFAULTS = Path(__file__).with_name("defaults.yaml")  # a whole safety.yaml, with comments
-LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: what a setpoint's 16 bits of thousandths hold
+DEFAULTS = Path(__file__).with_name("defaults.yaml")  # a complete safety.yaml, with comments
+LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: range of a setpoint's 16 bits, in thousandths
 
 _PLANNING_MINIMA = {
     "speed": 0.02,
@@ -40,11 +40,11 @@ _PLANNING_MINIMA = {
     "angular_velocity": 0.05,
     "angular_acceleration": 0.05,
 }
-"""What a limit of planned motion must allow at least: noise of the gyroscope and of poses would hide slower motion."""
+"""Lower bounds of planning limits: slower motion would be hidden by noise of gyroscope and poses."""
 
-_LOOKED_AT = 65  # grid places along the room and across it, where a take-off might end
+_LOOKED_AT = 65  # grid points along each side of the room, for places to take off to
 
-_QUARTER_TURN = math.pi / 2  # a limit of tilt below so many degrees is taken for radians
+_QUARTER_TURN = math.pi / 2  # a tilt limit below this many degrees is taken for radians
 
 Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
 Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
@@ -178,11 +178,11 @@ class _SafetyFile(_Section):
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """A key of safety.yaml, as the reader knows it."""
+    """A key of safety.yaml."""
 
     name: str  # with its section, as plan.speed
-    default: Any  # None where the file must have it
-    range: str  # what it may be, in words
+    default: Any  # None if the key is required
+    range: str  # allowed values, in words
 
 
 def all_keys() -> tuple[Key, ...]:
@@ -202,7 +202,7 @@ def all_keys() -> tuple[Key, ...]:
 
 
 def _range(kind: dict[str, Any]) -> str:
-    """Return what a JSON Schema allows, in words: "above 0, at most 2"."""
+    """Return the allowed values of a JSON Schema, in words: "above 0, at most 2"."""
     if "enum" in kind:
         return " or ".join(kind["enum"])
     if kind["type"] == "boolean":
@@ -225,7 +225,7 @@ Kind = TypeVar("Kind")
 
 
 def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
-    """Return a dataclass from the section with the same keys; `others` replace what the file says differently."""
+    """Return a dataclass from the section with the same keys; `others` replace values of the file."""
     # fields() wants a class that mypy knows to be a dataclass, and no bound of a type variable says that
     names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
     values = {name: getattr(section, name) for name in names}
@@ -235,14 +235,14 @@ def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
 
 @lru_cache(maxsize=1)
 def _defaults() -> dict[str, Any]:
-    """Return what a safety.yaml may leave out; nobody but its lab knows the vehicle and the room."""
+    """Return the defaults of all keys except vehicle and room, which only the lab knows."""
     defaults = read_plain(DEFAULTS)
     del defaults["vehicle"], defaults["space"]["low"], defaults["space"]["high"]
     return defaults
 
 
 def _complete(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content with the default of each key that it leaves out, in sections too."""
+    """Return the content with defaults for missing keys, also in sections."""
     added = _filled(content, _defaults())
     if "space" not in content:
         del added["space"]
@@ -258,11 +258,11 @@ def _filled(content: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]
 
 
 def load_limits(file: Path | str) -> Limits:
-    """Read safety.yaml, strictly validated, and find its vehicle. Keys that it leaves out have their default.
+    """Read safety.yaml, strictly validated, and find its vehicle. Missing keys have their default.
 
     Raises:
         InputError: unknown keys, limits that are not positive, that contradict each other, that make hovering
-            impossible or that allow more than the vehicle can do; with `file:line:column`.
+            impossible or that exceed the vehicle's abilities; with `file:line:column`.
     """
     content, places = read_yaml_with_places(file, _SafetyFile, _complete)
     _check_order(content, places)
@@ -337,7 +337,7 @@ def _version(text: str) -> tuple[int, ...]:
 
 
 def _check_order(content: _SafetyFile, places: Places) -> None:
-    """Check the order of values within the file alone."""
+    """Check the order of values within the file."""
     _check_limits(content, places)
     _check_space(content, places)
     _check_vehicle(content, places)
@@ -454,7 +454,7 @@ def _check_obstacles(limits: Limits, places: Places) -> None:
     if not space.obstacles:
         return
     middle, half = np.add(space.low, space.high) / 2, np.subtract(space.high, space.low) / 2
-    reach = space.beyond(middle, half)[SIDES:] - space.margin  # the room is a box: positive where it meets an obstacle
+    reach = space.beyond(middle, half)[SIDES:] - space.margin  # the room as a box: positive if it meets an obstacle
     if not (reach > 0.0).all():
         number = int(np.argmin(reach))
         raise InputError(
@@ -477,7 +477,7 @@ def _check_obstacles(limits: Limits, places: Places) -> None:
 
 
 def _check_vehicle_can(limits: Limits, places: Places) -> None:
-    """Refuse limits within which the vehicle cannot hover, and limits that allow more than it can do."""
+    """Refuse limits that exclude hovering, and limits that exceed the vehicle's abilities."""
     airframe, plan = limits.airframe, limits.plan
     if violated := hover_violation(airframe, plan):
         raise InputError(

@@ -1,10 +1,10 @@
-"""The table of limited quantities: what each limit binds, in which unit, on which side, and how it is computed.
+"""Table of limited quantities: what each limit bounds, its unit and side, and how the quantity is computed.
 
-Everything that holds motion to limits reads this table: the certificate, the expert's constraints and their check
-between nodes, the checks of bytes and of stops, the dry run, feasibility. A new limit is a row of QUANTITIES, a field
-of PlanLimits and its key in safety.yaml; it binds plans, certificates and bytes from then on.
+Everything that checks motion against limits reads this table: the certificate, the expert's constraints and their check
+between nodes, the checks of bytes and of stops, the dry run, feasibility. A new limit needs a row of QUANTITIES, a
+field of PlanLimits and a key in safety.yaml; then plans, certificates and bytes are held to it.
 
-A quantity is computed from a full state by way of its measure (see vehicle/measures.py), which is smooth and rises
+A quantity is computed from a full state through its measure (see vehicle/measures.py), which is smooth and increases
 with it. The optimiser bounds `row(measure)`, scaled so that each limit is 1, or -1 and 1 where there are two.
 """
 
@@ -22,7 +22,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import Scalar
 
 AT_MOST, AT_LEAST = 1, -1  # sides of a limit
-PACKET_ROUNDING = 1e-3  # m/s² and less, by which packets may round what they hold
+PACKET_ROUNDING = 1e-3  # m/s² and smaller units, largest rounding in packets
 
 
 def _identity(value: Any) -> Any:
@@ -37,24 +37,24 @@ def _zero(_: Airframe) -> float:
 class Quantity:
     """One row of the table."""
 
-    name: str  # as certificates and messages have it
+    name: str  # in certificates and messages
     unit: str
     limit: str  # field of PlanLimits
     key: str  # of that limit in safety.yaml, section plan
     side: int  # AT_MOST or AT_LEAST
     measure: int  # the first of its measures
-    count: int = 1  # of measures, all of which keep the limit
+    count: int = 1  # number of measures, all of which must keep the limit
     value: Callable[[Any], Any] = _identity  # the quantity, of its measure
     measured: Callable[[Any], Any] = _identity  # the measure, of its quantity
-    row: Callable[[Any], Any] = _identity  # what the optimiser bounds, of the measure
+    row: Callable[[Any], Any] = _identity  # the optimiser's bounded expression, of the measure
     hover: Callable[[Airframe], float] = _zero  # the quantity in hover
-    remedy: str = "loosen that limit"  # where hovering breaks it
+    remedy: str = "loosen that limit"  # if hovering exceeds it
     jumps: bool = False
-    """Whether it jumps between intervals, as h''' and ψ'' do; a boundary state or a setpoint alone does not tell it."""
-    power: int = 2  # of speed, with which it grows when a flight is slowed as a whole
-    ladder: str = ""  # field of FlightLimits, where measured motion is bound too
+    """Whether it jumps between intervals, like h''' and ψ''; a boundary state or setpoint alone cannot determine it."""
+    power: int = 2  # of speed, with which it scales if a whole flight is slowed
+    ladder: str = ""  # field of FlightLimits, if measured motion is limited too
     in_stop: Callable[[Limits], float] | None = None
-    """What a stop may reach, as braking adds to a turn flown at its limit; None where stops are not bound."""
+    """Limit of stops, as braking adds to a turn at its limit; None if stops are not limited."""
 
     @property
     def noun(self) -> str:
@@ -63,7 +63,7 @@ class Quantity:
 
     @property
     def which(self) -> slice:
-        """Return where its measures are."""
+        """Return the rows of its measures."""
         return slice(self.measure, self.measure + self.count)
 
     def allowed(self, limits: PlanLimits) -> float:
@@ -71,7 +71,7 @@ class Quantity:
         return float(getattr(limits, self.limit))
 
     def unused(self, airframe: Airframe) -> float:
-        """Return the value at which no share of the limit is used: nothing, or for a least value that of hover."""
+        """Return the value of usage 0: zero, or for a lower limit the value in hover."""
         return 0.0 if self.side == AT_MOST else self.hover(airframe)
 
     def worst(self, measured: NDArray) -> NDArray:
@@ -79,7 +79,7 @@ class Quantity:
         return np.asarray(self.value(self.side * np.max(self.side * measured[self.which], axis=0)))
 
     def excess(self, value: Any, limit: float) -> Any:
-        """Return by how much a value lies beyond a limit; negative within it."""
+        """Return by how much a value exceeds a limit; negative within it."""
         return self.side * (value - limit)
 
 
@@ -92,7 +92,7 @@ def _squared_tangent_of_half(tilt: Any) -> Any:
 
 
 def _versine(squared_tangent_of_half: Any) -> Any:
-    """Return 1 - cos of the tilt: upside down the measure is infinite, which no search should meet."""
+    """Return 1 - cos of the tilt, which stays finite upside down, where the measure does not."""
     return 2.0 * squared_tangent_of_half / (1.0 + squared_tangent_of_half)
 
 
@@ -134,10 +134,10 @@ QUANTITIES = (
         hover=lambda _: GRAVITY, in_stop=lambda limits: limits.plan.specific_thrust_min - PACKET_ROUNDING,
     ),
 )  # fmt: skip
-INSTANT = tuple(quantity for quantity in QUANTITIES if not quantity.jumps)  # what a boundary state or setpoint tells
-ON_LADDER = tuple(quantity for quantity in QUANTITIES if quantity.ladder)  # what the pilot watches
+INSTANT = tuple(quantity for quantity in QUANTITIES if not quantity.jumps)  # determined by a boundary state or setpoint
+ON_LADDER = tuple(quantity for quantity in QUANTITIES if quantity.ladder)  # monitored by the pilot
 
-# The optimiser's rows, one a measure: bounds of each in units of its scale, and which of them jump.
+# The optimiser's rows, one per measure: bounds in units of its scale, and which of them jump.
 LOWER, UPPER = np.full(measures.MEASURES, -np.inf), np.full(measures.MEASURES, np.inf)
 JUMPS = np.zeros(measures.MEASURES, dtype=bool)
 _ROWS: list[Callable[[Any], Any]] = [_identity] * measures.MEASURES

@@ -1,4 +1,4 @@
-"""Slow a whole profile by one speed factor, the last resort: as h tends to 0 motion tends to hover and is certified."""
+"""Slow a whole profile by one speed factor, as a last resort: as h tends to 0, motion tends to hover, which passes."""
 
 from dataclasses import dataclass
 
@@ -16,19 +16,19 @@ from cfplan.safety.speed_caps import SpeedCaps
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
-RESOLUTION = 1e-4  # of the speed factor that is sought
-LEAST_SPEED_FACTOR = 3e-3  # slower than this is no flight
-_AIM = RESOLUTION / 2  # below a limit, so that the search ends from the passing side
+RESOLUTION = 1e-4  # of the speed factor
+LEAST_SPEED_FACTOR = 3e-3  # smaller ones do not count as flight
+_AIM = RESOLUTION / 2  # below a limit, so that the search ends on the passing side
 _TRIALS = 60
 
 
 @dataclass(frozen=True, slots=True)
 class Slowed:
-    """A certified trajectory, and how much slower it is than what was asked for."""
+    """A certified trajectory, and how much it was slowed."""
 
     trajectory: Trajectory
     certificate: Certificate
-    speed_factor: float  # everywhere; 1: not slowed
+    speed_factor: float  # of the whole profile; 1: not slowed
 
 
 def slow_until_certified(
@@ -39,12 +39,12 @@ def slow_until_certified(
     caps: SpeedCaps | None = None,
     deadline: Deadline = NEVER,
 ) -> Slowed:
-    """Return the trajectory itself where it passes, else at the largest speed factor that does, within RESOLUTION.
+    """Return the trajectory if it passes, else slowed by the largest speed factor that passes, within RESOLUTION.
 
     `certificate` is the trajectory's, if it is known. After the deadline the first speed factor that passes is taken.
 
     Raises:
-        InfeasibleError: no speed factor passes, because hovering or the path itself breaks a limit; says which.
+        InfeasibleError: no speed factor passes, because hovering or the path itself exceeds a limit; names it.
     """
     certificate = certificate or certify(trajectory, limits, space, caps)
     if certificate.passed:
@@ -52,7 +52,7 @@ def slow_until_certified(
     _check_hover(trajectory.airframe, limits)
     _check_place(certificate)
 
-    # False position between hover and what failed, in the square of the factor: accelerations grow with it.
+    # False position between hover and the failure, in the square of the factor, with which accelerations scale.
     low, low_excess = 0.0, _hover_share(trajectory.airframe, limits) - 1.0
     high, high_excess = 1.0, _excess(certificate)
     best: Slowed | None = None
@@ -91,7 +91,7 @@ def _excess(certificate: Certificate) -> float:
 
 
 def _hover_share(airframe: Airframe, limits: PlanLimits) -> float:
-    """Return the worst share that remains as the speed tends to 0."""
+    """Return the worst usage that remains as the speed tends to 0."""
     return max((q.hover(airframe) - (zero := q.unused(airframe))) / (q.allowed(limits) - zero) for q in QUANTITIES)
 
 

@@ -1,4 +1,4 @@
-"""The space to fly in, the obstacles in it, and the check that a path stays clear of its faces.
+"""The space to fly in, its obstacles, and the check that a path stays clear of its faces.
 
 A face is a wall, the floor, the ceiling, or the surface of an obstacle; plans keep the same margin from each.
 """
@@ -20,18 +20,18 @@ _AXES = ("x", "y", "z")
 FLOOR = 2  # its number among the faces
 SIDES = 6  # faces of the room itself, with floor and ceiling; obstacles follow
 TOLERANCE = 1e-6
-"""m that a position may lie beyond a wall, or a margin before it, and count as inside: a thousandth of the rounding in
-packets, and far above the rounding of sums and of a path's equations. A path drawn at the margin keeps it."""
-_MILLIMETRES = 30.0  # larger coordinates of a path that lies in the space when divided by 1000 are in millimetres
+"""m, tolerance of walls and margins: a thousandth of the rounding in packets, far above the rounding of sums and of a
+path's equations. A path drawn at the margin keeps it."""
+_MILLIMETRES = 30.0  # larger coordinates count as millimetres if a thousandth of the path lies in the space
 _BLOCK = 16  # consecutive positions whose bounding box is checked first
 _ROUND = 33  # points of a cylinder's outline in drawings
-_AT_ONCE = 1 << 14  # distances between positions and obstacles that are computed at once, at most
-_PARTS, _LEVELS = 8, 6  # into which an undecided stretch of a path is cut, and how often at most
-_WORST = 1e-4  # m, error of the least distance between a path and the obstacles, at most
+_AT_ONCE = 1 << 14  # most distances between positions and obstacles computed at once
+_PARTS, _LEVELS = 8, 6  # parts into which an undecided stretch of a path is cut, and most repetitions
+_WORST = 1e-4  # m, largest error of the least distance between a path and the obstacles
 
 
 def inside(beyond: ArrayLike, rounding: float = 0.0) -> Any:
-    """Return whether positions count as inside by how far they are `beyond` a face or its margin, m; NaN does not.
+    """Return whether positions `beyond` a face or its margin by this much, m, count as inside; NaN does not.
 
     All comparisons with walls and obstacles use this function. `rounding`, m, is the rounding of the positions.
     """
@@ -75,7 +75,7 @@ Obstacle = Box | Cylinder
 
 
 def outline(obstacle: Obstacle) -> NDArray:
-    """Return an obstacle as it is seen from above, (N, 2) m, as a closed polygon."""
+    """Return the outline of an obstacle from above, (N, 2) m, as a closed polygon."""
     x, y, _, a, b, _, radius, yaw = obstacle.prism
     turn = np.linspace(0.0, 2.0 * np.pi, _ROUND) if radius else np.pi * (np.arange(5) / 2 + 0.25)
     flat = np.stack([np.cos(turn), np.sin(turn)], axis=1)
@@ -85,7 +85,7 @@ def outline(obstacle: Obstacle) -> NDArray:
 
 @dataclass(frozen=True, slots=True)
 class Space:
-    """A box, the obstacles in it, and the distance that plans keep from its walls and from these."""
+    """A box, its obstacles, and the margin that plans keep from walls and obstacles."""
 
     low: tuple[float, float, float]  # m
     high: tuple[float, float, float]  # m
@@ -113,7 +113,7 @@ class Space:
     def nearest(self, positions: ArrayLike, half: ArrayLike = 0.0, *, floor: bool = True) -> tuple[NDArray, NDArray]:
         """Return how far positions, (N, 3) m, are beyond their worst face, (N,) m, and its number, (N,).
 
-        It is the largest of beyond(), in less time and memory if there are many obstacles. The floor may be left out.
+        This is the largest of beyond(), but faster and with less memory for many obstacles. The floor may be left out.
         """
         points = np.asarray(positions, dtype=float)
         sizes = np.broadcast_to(np.asarray(half, dtype=float), points.shape)
@@ -138,10 +138,10 @@ class Space:
     def farthest(self, positions: NDArray) -> float:
         """Return how far the worst of positions, (N, 3) m, is beyond a face less its margin, m.
 
-        Made for many that follow a way. Where all are clear, obstacles may be farther off than it says.
+        For many positions along a way. If all are clear, obstacles may be farther away than the result.
         """
         low, high = positions.min(axis=0), positions.max(axis=0)
-        beyond = self.beyond((low + high) / 2, (high - low) / 2)  # of a box about all
+        beyond = self.beyond((low + high) / 2, (high - low) / 2)  # of a box around all
         near = ~(beyond[SIDES:] <= 0.0)
         clear = float(np.where(near, -np.inf, beyond[SIDES:]).max(initial=-np.inf))
         if not near.any():
@@ -163,7 +163,7 @@ class Space:
     def swept(self, boxes: NDArray) -> tuple[NDArray, NDArray]:
         """Return how far vehicles come beyond their worst face without its margin, (N,) m, and its number, (N,).
 
-        `boxes`, (N, S, 2, 3) m, hold what each sweeps in S parts of its way to the floor, which does not count itself.
+        `boxes`, (N, S, 2, 3) m, are swept in S parts of each way to the floor; the floor itself does not count.
         """
         low, high = boxes[:, :, 0].reshape(-1, 3), boxes[:, :, 1].reshape(-1, 3)
         beyond, face = (
@@ -210,17 +210,17 @@ class _Prisms(NamedTuple):
     sin: NDArray  # (K,)
 
     def only(self, numbers: NDArray) -> "_Prisms":
-        """Return those with these numbers."""
+        """Return the prisms with these numbers."""
         return _Prisms(*(values[numbers] for values in self))
 
     def of_rows(self, numbers: NDArray) -> "_Prisms":
-        """Return one for each of P rows of points, (P, N, 3)."""
+        """Return one prism for each of P rows of points, (P, N, 3)."""
         return _Prisms(*(values[numbers][:, None] for values in self))
 
 
 @lru_cache(maxsize=8)
 def _prisms(obstacles: tuple[Obstacle, ...]) -> _Prisms:
-    """Return obstacles in one form: a box has radius 0, and the rectangle of a cylinder is a point."""
+    """Return obstacles as prisms: a box has radius 0, and the rectangle of a cylinder is a point."""
     table = np.array([each.prism for each in obstacles])
     return _Prisms(table[:, :3], table[:, 3:6], table[:, 6], np.cos(table[:, 7]), np.sin(table[:, 7]))
 
@@ -236,7 +236,7 @@ def _offsets(prisms: _Prisms, points: NDArray, half: ArrayLike = 0.0) -> tuple[N
 
 
 def _joined(a: NDArray, b: NDArray) -> NDArray:
-    """Return the distance from a corner by those from its two sides: Euclidean outside, the nearer side's inside."""
+    """Return the distance to a corner from those to its sides: Euclidean outside, that of the nearer side inside."""
     return np.hypot(np.maximum(a, 0.0), np.maximum(b, 0.0)) + np.minimum(np.maximum(a, b), 0.0)
 
 
@@ -278,7 +278,7 @@ def _slope(a: NDArray, b: NDArray) -> tuple[NDArray, tuple[NDArray, NDArray]]:
 
 
 def check_space(path: Path, space: Space, *, waypoints: ArrayLike | None = None, where: str = "") -> None:
-    """Refuse a path that leaves the space, or comes within the margin of a face, at waypoints or between them.
+    """Refuse a path that leaves the space, or comes within the margin of a face, anywhere.
 
     Raises:
         InfeasibleError: naming the first waypoint at fault, else the worst place, and by how much.
@@ -322,7 +322,7 @@ def distances_beyond(path: Path, space: Space) -> tuple[NDArray, NDArray]:
 class _Stretches(NamedTuple):
     """Stretches of a path beside one obstacle each."""
 
-    cell: NDArray  # (C,) int: which value of the answer each belongs to
+    cell: NDArray  # (C,) int: index of the result that each belongs to
     piece: NDArray  # (C,) int
     obstacle: NDArray  # (C,) int
     ends: NDArray  # (C, 2): s
@@ -331,7 +331,7 @@ class _Stretches(NamedTuple):
     worst: NDArray  # (C,) s, about where it is worst
 
     def some(self, which: NDArray) -> "_Stretches":
-        """Return some of them."""
+        """Return some of the stretches."""
         return _Stretches(*(values[which] for values in self))
 
 
@@ -355,7 +355,7 @@ def beyond_obstacles(path: Path, space: Space) -> tuple[NDArray, NDArray]:
     around = np.linalg.norm(places - middle[:, None], axis=-1).max(axis=1)
     around += (np.diff(path.breaks) / (count - 1)) ** 2 / 8 * bend
     seen = space.margin - _distances(prisms, middle[:, None])
-    most = seen + around[:, None]  # a distance changes by no more than the position does
+    most = seen + around[:, None]  # distances change no faster than positions
     close = ~(most <= min(seen.max(), 0.0))
     at = s.copy()
     beyond = np.repeat(np.where(close, -np.inf, most).max(axis=1)[:, None], count, axis=1)
@@ -397,7 +397,7 @@ def _cut(
     way = np.diff(places, axis=1)
     begin, end = distance[:, :-1], distance[:, 1:]
     falls, rises = (slope[:, :-1] * way).sum(axis=-1), (slope[:, 1:] * way).sum(axis=-1)
-    dips = (falls < 0.0) & (rises > 0.0)  # between the ends: where the tangents meet
+    dips = (falls < 0.0) & (rises > 0.0)  # between the ends, where the tangents meet
     share = np.clip((end - rises - begin) / np.where(dips, falls - rises, 1.0), 0.0, 1.0)
     share = np.where(dips, share, falls < 0.0)
     lowest = np.where(dips, begin + share * falls, np.where(falls < 0.0, end, begin))
@@ -415,7 +415,7 @@ def _cut(
 
 def _raise(at: NDArray, beyond: NDArray, stretches: _Stretches) -> None:
     """Raise `beyond`, (M, N) m, to the bounds of stretches where these are larger, and set `at`, (M, N) s, there."""
-    order = np.argsort(stretches.most)  # of several for one cell the last one stays
+    order = np.argsort(stretches.most)  # of several in one cell, the last one stays
     cell, most = stretches.cell[order], stretches.most[order]
     more = most > beyond.ravel()[cell]
     np.put(at, cell[more], stretches.worst[order][more])

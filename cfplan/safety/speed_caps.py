@@ -8,14 +8,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from cfplan.errors import InputError
 
-_BEYOND = 1e-9  # share of a path's length in s by which a cap's points may lie past its end, as numbers round
+_BEYOND = 1e-9  # fraction of a path's length in s, rounding tolerance for a cap's points past its end
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedCaps:
     """A speed at rising places along a path, linear between them and constant beyond the first and the last.
 
-    Raises InputError where there is no place, a number is not finite, a speed is not positive or places do not rise.
+    Raises InputError if there is no place, a number is not finite, a speed is not positive, or places do not rise.
     """
 
     s: tuple[float, ...]
@@ -35,7 +35,7 @@ class SpeedCaps:
 
     @staticmethod
     def of(s: ArrayLike, speed: ArrayLike) -> "SpeedCaps":
-        """Return caps of places, (K,), and speeds, (K,) m/s."""
+        """Return caps from places, (K,), and speeds, (K,) m/s."""
         return SpeedCaps(tuple(np.asarray(s, float).tolist()), tuple(np.asarray(speed, float).tolist()))
 
     def at(self, s: ArrayLike) -> NDArray:
@@ -43,7 +43,7 @@ class SpeedCaps:
         return np.interp(np.asarray(s, dtype=float), self.s, self.speed)
 
     def part(self, begin: float, end: float) -> "SpeedCaps":
-        """Return the caps of that part of the path, with s from its beginning."""
+        """Return the caps of a part of the path, with s from its beginning."""
         places = np.array(self.s)
         inside = places[(places > begin) & (places < end)]
         kept = np.concatenate([[begin], inside, [end]])

@@ -1,4 +1,4 @@
-"""Vehicles as they may be: draws of what a dry run cannot know, from the spreads of an airframe and of late poses.
+"""Drawn vehicles: random draws of what is unknown before a flight, from the spreads of airframe and pose delays.
 
 Each quantity is stratified: its values lie at as many equally probable quantiles as there are draws, shuffled, so that
 few draws show the tails of all of them. The same airframe and room always give the same draws.
@@ -15,29 +15,29 @@ from cfplan.vehicle.airframe import Airframe
 
 DRAWS = 32
 RADIO = 0.002  # s, from the pilot to the vehicle
-LATENCY_ERROR = 0.003  # s, by which the room's latency may be stated too low or too high
+LATENCY_ERROR = 0.003  # s, error of the room's stated latency, either sign
 _SEED = 45
 _HALF_WIDTH = 1.96  # standard deviations in half the width of 95 %
 
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """A vehicle in a room as they may be."""
+    """A drawn vehicle in a drawn room."""
 
     airframe: Airframe
-    pose_age: float  # s, of a pose's position as the filter takes it
-    attitude_age: float  # s, of its attitude, which is not carried on
+    pose_age: float  # s, of a pose's position when the filter fuses it
+    attitude_age: float  # s, of its attitude, which is not extrapolated
     pose_phase: float  # s from the beginning to the first pose
     seed: int  # of the poses' noise
 
 
 def nominal_draw(airframe: Airframe, pose: PoseLimits) -> Draw:
-    """Return the vehicle that is as its airframe says, in the mean room."""
+    """Return the nominal vehicle in the nominal room."""
     return _drawn(airframe, pose, np.zeros(5), np.full(2, 0.5), 0)
 
 
 def draw_vehicles(airframe: Airframe, pose: PoseLimits, count: int = DRAWS, seed: int = _SEED) -> list[Draw]:
-    """Return so many vehicles, drawn from the spreads of the airframe and of the room."""
+    """Return `count` vehicles, drawn from the spreads of airframe and room."""
     chance = np.random.default_rng(seed)
     quantiles = np.stack([(chance.permutation(count) + 0.5) / count for _ in range(7)], axis=1)
     normal = np.vectorize(NormalDist().inv_cdf)(quantiles[:, :5])
@@ -55,6 +55,6 @@ def _drawn(airframe: Airframe, pose: PoseLimits, deviations: NDArray, quantiles:
         velocity_moment=(moment * airframe.velocity_moment[0], moment * airframe.velocity_moment[1]),
         motor_time_constant=lag * airframe.motor_time_constant,
     )  # fmt: skip
-    # Cameras look at any moment between two of the pilot's sendings, to which it carries positions on.
+    # Cameras expose at any moment between two transmissions of the pilot, which extrapolates positions to these.
     wrong, waited = (2.0 * age - 1.0) * LATENCY_ERROR, phase / pose.rate
     return Draw(vehicle, max(RADIO + wrong, 0.0), max(pose.latency + wrong + waited, 0.0) + RADIO, waited, seed)

@@ -1,12 +1,12 @@
-"""Dry run: the very bytes that will be sent, flown by simulated vehicles before the flight.
+"""Dry run: the bytes to be sent, flown by simulated vehicles before the flight.
 
-What the vehicle flies by is what it will fly by: the firmware's controller on what its Kalman filter believes, which
-gets late and noisy poses. What nobody knows before the flight is drawn (see `draws`): the deviation to expect is the
-median and the 95th percentile over the draws, and the latter decides. Each begins in hover at the start, receives each
-payload when it is due and hovers on the last one.
+The simulated vehicle is flown like the real one: by the firmware's controller on the estimate of its Kalman filter,
+which gets late and noisy poses. What is unknown before the flight is drawn (see `draws`): the expected deviation is the
+median over the draws, and the 95th percentile decides. Each draw begins in hover at the start, receives each payload
+when it is due, and hovers at the last one.
 
-In the air there is no time for that. There one vehicle, as its airframe says and knowing its true state, flies on from
-where the simulated one is: rehearse_motion() and rehearse_setpoints().
+In the air there is no time for that: the nominal vehicle, with exact knowledge of its state, continues from the
+simulated state: rehearse_motion() and rehearse_setpoints().
 """
 
 import math
@@ -36,17 +36,17 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.joint import JoinedTrajectory
 from cfplan.vehicle.trajectory import Trajectory
 
-SETTLING = 1.0  # s simulated after the last payload, which the vehicle keeps
-SETTLED = 0.02  # m, nearer than this to the end it has arrived
-ARRIVED = 0.05  # m, and no farther than this may it be at last
+SETTLING = 1.0  # s simulated after the last payload, which stays in force
+SETTLED = 0.02  # m from the end, within which the vehicle has arrived
+ARRIVED = 0.05  # m, largest final error
 EXPECTED = 0.95  # quantile over the draws that decides
-_STRIDE = 5  # ms between the moments at which places are compared
+_STRIDE = 5  # ms between comparisons of positions
 _HINT = "plan with lower limits, or check mass, thrust and motor lag of the airframe"
 
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What decides whether a flight passes; of a dry run the 95th percentile over its draws."""
+    """The figures that decide whether a flight passes; in a dry run the 95th percentile over its draws."""
 
     reason: str  # why it failed; empty when it passed
     deviation: float  # m, largest distance from the trajectory at the same time
@@ -58,7 +58,7 @@ class Rehearsal:
 
     @property
     def passed(self) -> bool:
-        """Return whether the bytes may fly."""
+        """Return whether the rehearsal passed."""
         return not self.reason
 
     def require_passed(self) -> None:
@@ -69,15 +69,15 @@ class Rehearsal:
 
 @dataclass(frozen=True, slots=True)
 class DryRun(Rehearsal):
-    """The result of a dry run; what is not over the draws is of the vehicle that is as its airframe says."""
+    """The result of a dry run; figures that are not over the draws are those of the nominal vehicle."""
 
     deviation_median: float  # m, over the draws, of the worst deviation of each
     deviations: tuple[float, ...]  # m, the worst of each draw
     deviation_rms: float  # m, while it moves
-    path_distance: float  # m, worst distance from the path, whenever it is there
+    path_distance: float  # m, worst distance from the path, at any time
     settle_time: float  # s, from the end of the motion until it stays within SETTLED; inf when it never does
-    saturation: float  # share of the time for which the motor that fares worst is at either end of its range
-    real_time_factor: float  # simulated seconds a second, of all draws at once
+    saturation: float  # fraction of time that the worst motor is at either end of its range
+    real_time_factor: float  # simulated seconds per second, all draws together
     knows_drag: bool  # whether the filter models rotor drag, as that of the oldest permitted firmware may
     loop: ClosedLoop  # the whole flight
 
@@ -89,7 +89,7 @@ class DryRun(Rehearsal):
         return f"{100 * self.deviation_median:.1f} cm in the median, {100 * self.deviation:.1f} cm in 95 %"
 
     def summary(self) -> dict[str, bool | float | str | None]:
-        """Return everything but the flights themselves, for a file; a value that is not finite is None, as in JSON."""
+        """Return the figures for a file, without the flights; values that are not finite become None."""
         names = [field.name for field in fields(self) if field.name not in ("loop", "deviations")]
         figures = {name: getattr(self, name) for name in names}
         return {"passed": self.passed} | {
@@ -97,7 +97,7 @@ class DryRun(Rehearsal):
         }
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return everything but the flights themselves, for people."""
+        """Return rows of figures for people."""
         drag = "models rotor drag" if self.knows_drag else "without a model of rotor drag, as before firmware 2026.04"
         return [
             ("verdict", self.reason or "passed"),
@@ -117,11 +117,11 @@ class DryRun(Rehearsal):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsed:
-    """What is flown in a dry run, and what it is compared with."""
+    """The setpoints of a dry run, and the motion for comparison."""
 
     setpoints: NDArray  # (N, 20) as in `mellinger`
     times: NDArray  # (N,) s, when each is sent
-    yaw: float  # rad, of the hover in which it begins where it is wanted
+    yaw: float  # rad, of the initial hover
     wanted_at: Callable[[NDArray], NDArray]  # times (N,) s -> (N, 3) m
     moving: float  # s
     duration: float  # s, to the end of the simulation
@@ -144,12 +144,12 @@ def rehearsed_flight(encoded: EncodedFlight, trajectory: Trajectory | JoinedTraj
 
 
 def rehearse_draws(flight: Rehearsed, limits: Limits) -> DryRun:
-    """Fly on the nominal vehicle and on the draws, and judge what most of them do.
+    """Fly the nominal vehicle and the draws, and judge the quantile over the draws.
 
     The real-time factor counts everything but the compilation at the first call ever.
     """
     nominal = nominal_draw(limits.airframe, limits.pose)
-    fly_drawn(replace(flight, duration=0.0), nominal, limits)  # compiles if need be; the next line imports
+    fly_drawn(replace(flight, duration=0.0), nominal, limits)  # compiles if necessary
     _distances_to_path(np.zeros((1, 3)), np.zeros((1, 3)))
     begun = time.perf_counter()
     steps = round(flight.duration / TIME_STEP) + 1
@@ -168,14 +168,13 @@ def rehearse_draws(flight: Rehearsed, limits: Limits) -> DryRun:
 
 
 def fly_drawn(flight: Rehearsed, draw: Draw, limits: Limits, lost: float = math.inf) -> ClosedLoop:
-    """Fly on a drawn vehicle, whose controller and filter are told what the pilot tells them.
+    """Fly a drawn vehicle, whose controller and filter have the parameters that the pilot sets.
 
     After `lost`, s, neither setpoints nor poses are sent, and its supervisor levels it out and stops its motors.
     """
     planned, drawn = limits.airframe, draw.airframe
     gains = gains_for(planned)
-    # Hover has lasted too short for the controller's integral, of some 25 s, to take off what weight and thrust are
-    # other than it was told.
+    # The hover was too short for the controller's integral, of some 25 s, to compensate for errors of mass and thrust.
     sunk = GRAVITY * (drawn.mass * planned.thrust_scale / drawn.thrust_scale - planned.mass) / gains.kp_z
     start = hovering(drawn, flight.wanted_at(np.zeros(1))[0] - [0.0, 0.0, sunk], flight.yaw)
     steps = round(flight.duration / TIME_STEP) + 1
@@ -208,7 +207,7 @@ def rehearse_motion(
     conditions: Conditions = AS_PLANNED,
     snapshot: NDArray | None = None,
 ) -> Rehearsal:
-    """Fly as fly_motion() does; compare with `motion`."""
+    """Fly like fly_motion(); compare with `motion`."""
     loop = fly_motion(encoded, motion, airframe, conditions=conditions, snapshot=snapshot)
     return _rehearsed(loop, _away(loop, motion.at(loop.time[::_STRIDE]).position), limits)
 
@@ -223,7 +222,7 @@ def fly_motion(
 ) -> ClosedLoop:
     """Return the flight of the payloads on one vehicle that knows its true state.
 
-    `snapshot`, (31,), is that of another flight from which this one goes on, instead of a hover.
+    `snapshot`, (31,), is the state of another flight that this one continues, instead of a hover.
     """
     start = motion.at(0.0)
     begin = hovering(airframe, start.position, float(start.yaw)) if snapshot is None else snapshot
@@ -255,7 +254,7 @@ def fly_on(payloads: NDArray, airframe: Airframe, snapshot: NDArray, rate: float
 def _judge(
     runs: Sequence[Rehearsal], loop: ClosedLoop, wanted: NDArray, duration: float, limits: Limits
 ) -> DryRun:  # fmt: skip
-    """Return what the runs of all draws come to, and what the flight of the nominal vehicle adds."""
+    """Return the result over the runs of all draws, with figures of the nominal vehicle's flight."""
     times, positions, error = loop.time[::_STRIDE], loop.position[::_STRIDE], _away(loop, wanted)
     known = np.isfinite(positions).all(axis=1)
     nearest = np.where(known, _distances_to_path(np.where(known[:, None], positions, 0.0), wanted), np.inf)
@@ -278,7 +277,7 @@ def _judge(
 
 
 def _expected(runs: Sequence[Rehearsal], limits: FlightLimits) -> Rehearsal:
-    """Return the quantile EXPECTED of each figure, the higher neighbour where it lies between two."""
+    """Return the quantile EXPECTED of each figure, rounded up to a draw."""
     at = int(np.ceil(EXPECTED * (len(runs) - 1)))
     worst = sorted(runs, key=lambda run: run.deviation)[at]
     figures = {
@@ -333,7 +332,7 @@ def _lasting(values: NDArray, patience: float) -> float:
 
     window = min(max(1, round(patience / TIME_STEP)), len(values))
     values = np.where(np.isfinite(values), values, np.inf)
-    return float(minimum_filter1d(values, window, mode="nearest").max())  # ends stand for what is not simulated
+    return float(minimum_filter1d(values, window, mode="nearest").max())  # the ends stand in for the time not simulated
 
 
 def _distances_to_path(positions: NDArray, wanted: NDArray) -> NDArray:

@@ -1,7 +1,7 @@
 """Flights under a geometric controller, as in the paper's simulations: deviation, thrust asked, states reached.
 
-They say how well a motion can be followed at all, by a controller that knows the true state and the trajectory itself.
-How a Crazyflie follows the bytes that it is sent is for the dry run.
+They show how well a motion can be followed at all, by a controller that knows the true state and the trajectory. How a
+Crazyflie follows the bytes that it is sent is the subject of the dry run.
 """
 
 from dataclasses import dataclass
@@ -23,16 +23,16 @@ from cfplan.simulation.engine.layout import POSITION, VELOCITY, hovering
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
-LOST = 1.0  # m: a flight that is farther from its place has failed, and is over (the paper's failure)
+LOST = 1.0  # m, deviation at which a flight has failed and ends (as in the paper)
 SETTLING = 1.0  # s simulated after the end of the motion
 
 
 @dataclass(frozen=True, slots=True)
 class FollowedFlight:
-    """How a trajectory was followed."""
+    """The result of following a trajectory."""
 
-    deviation: float  # m, largest distance from where the trajectory is at that time; LOST where it failed
-    asked_violation: float  # N, mean over time and motors of what was asked beyond a motor's range
+    deviation: float  # m, largest distance from the trajectory at the same time; LOST if it failed
+    asked_violation: float  # N, commanded thrust beyond a motor's range, mean over time and motors
     flight: GeometricFlight
 
     @property
@@ -42,7 +42,7 @@ class FollowedFlight:
 
     @property
     def top_speed(self) -> float:
-        """Return the fastest that it flew, m/s; NaN where its state is lost."""
+        """Return the highest speed, m/s; NaN if the state diverged."""
         return float(np.linalg.norm(self.flight.states[:, VELOCITY], axis=1).max())
 
 
@@ -58,7 +58,7 @@ def fly_geometric(trajectory: Trajectory, airframe: Airframe) -> FollowedFlight:
 
 
 def control_times(trajectory: Trajectory) -> NDArray:
-    """Return when the controller is asked, (K,) s from the start of the motion to SETTLING after its end."""
+    """Return the controller's times, (K,) s from the start of the motion to SETTLING after its end."""
     return np.arange(0.0, trajectory.duration + SETTLING, CONTROL_STEPS * TIME_STEP)
 
 
@@ -74,7 +74,7 @@ def positions_by_both(step: BodyStep, trajectory: Trajectory, airframe: Airframe
 
 
 def thrust_violation(thrust: NDArray, airframe: Airframe) -> float:
-    """Return the mean over time and motors of what thrusts, (N, 4) N, exceed the motors' range by."""
+    """Return the excess of thrusts, (N, 4) N, over the motors' range, mean over time and motors."""
     low, high = airframe.motor_thrust_min, airframe.motor_thrust_max
     return float(np.mean(np.maximum(thrust - high, 0.0) + np.maximum(low - thrust, 0.0)))
 
@@ -83,7 +83,7 @@ def nearest_states(flight: GeometricFlight, trajectory: Trajectory, times: NDArr
     """Return how near the flight comes to each planned state in the time before it: metres and m/s, (N-1,) each.
 
     `times`, (N,) s ascending, are those of the planned states r(sᵢ). From the state reached at tᵢ the controller goes
-    on towards r(sᵢ₊₁) until tᵢ₊₁; of the states on the way the one is taken whose position is nearest.
+    on towards r(sᵢ₊₁) until tᵢ₊₁; of the states on the way the one with the nearest position is used.
     """
     planned = trajectory.at(times[1:])
     places, speeds = np.full(len(times) - 1, np.inf), np.full(len(times) - 1, np.inf)

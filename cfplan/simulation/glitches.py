@@ -29,12 +29,14 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
-AFTERWARDS = 1.0  # s simulated after the gap
+AFTERWARDS = 2.0  # s simulated after the gap: at little thrust a vehicle may stray for 1.5 s until it is lost
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
 WITHOUT_POSES_EVERY = 5  # setpoints
-SAMPLED_EVERY = 10  # setpoints, where the vehicle is far from lost
-CRITICAL_USAGE = 0.6  # usage above which it is not far; in 26 flights to 3 m/s it rose by 0.15 at most between samples
+SAMPLED_EVERY = 10  # setpoints, if the vehicle is far from lost
+CRITICAL_USAGE = (
+    0.6  # usage above which it is not far; in 26 flights up to 3 m/s it rose by at most 0.15 between samples
+)
 _NEAR_WORST = 0.03  # usage; around samples this close to the worst one every setpoint is simulated
 _STEP = 2  # ms, of the simulation from the gap on: steps of 4 ms underestimate saturation of the motors
 
@@ -50,7 +52,7 @@ class GlitchMoments:
 
     @property
     def worst(self) -> tuple[str, int]:
-        """Return the kind of gap and the setpoint after which the vehicle strays farthest."""
+        """Return the kind of gap and the setpoint with the largest deviation."""
         kind, number = np.unravel_index(np.argmax(np.nan_to_num(self.deviation, nan=np.inf)), self.deviation.shape)
         return KINDS[int(kind)], int(number)
 
@@ -172,5 +174,5 @@ def _gaps(flight: _Flight, wanted: NDArray, limits: Limits, gap: float) -> NDArr
         steps=(milliseconds + round(1000 * AFTERWARDS)) // _STEP, step=_STEP, blind_until=milliseconds,
     )  # fmt: skip
     found, worst = simulate(batch, schedule), np.full((2, *wanted.shape), np.nan)
-    worst[:, kind, number] = np.nan_to_num((found.deviation, found.tilt), nan=np.inf)  # NaN is: not simulated
+    worst[:, kind, number] = np.nan_to_num((found.deviation, found.tilt), nan=np.inf)  # NaN: not simulated
     return worst

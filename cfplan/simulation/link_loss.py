@@ -39,16 +39,16 @@ from cfplan.simulation.engine.layout import (
 from cfplan.simulation.engine.run import NEVER, PART, Schedule, Vehicles, arrival_times, simulate
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 
-# s after the last setpoint; the same in every firmware that may fly, see flight/firmware.py
+# s after the last setpoint; the same in all permitted firmware, see flight/firmware.py
 LEVEL_AFTER = Timeouts().level_out_at_latest
 _PARTS = 9  # boxes of a sweep, if there are obstacles
 TUBE_PART = 40  # ms of motion per box of a tube, a multiple of the step
-_STEP, _FIRST_STEP = 4, 8  # ms, of the simulation after the last setpoint; the same in a first look
+_STEP, _FIRST_STEP = 4, 8  # ms, step after the last setpoint; the same in the coarse simulation
 _LONGEST = 4000  # ms simulated after the last setpoint, unless the vehicle lies on the floor earlier
 _NEAR = 0.1  # m from a wall, within which an accelerometer that reads too much is simulated too
-ALLOWANCE = 0.1  # m, by which a first look may underestimate the distance; at most 0.05 m in 51 flights, to 3 m/s
+ALLOWANCE = 0.1  # m, margin of the coarse simulation, which was off by at most 0.05 m in 51 flights up to 3 m/s
 _SLOW_ALLOWANCE = 0.07  # m, the same for slow motion; at most 0.068 m in 765 motions, far from the walls
-_FIRST_EVERY, _SLOW_EVERY, _FORESEEN_EVERY = 2, 8, 16  # setpoints from one first look to the next
+_FIRST_EVERY, _SLOW_EVERY, _FORESEEN_EVERY = 2, 8, 16  # setpoints between samples of the coarse simulation
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +124,9 @@ def link_loss_near_walls(
 ) -> LinkLossMoments:
     """Lose the link after each setpoint that may leave the vehicle `within` m of a wall, and after the worst one.
 
-    Setpoints that end farther inside than `within` and ALLOWANCE by a first look are not simulated closely: they count
-    as ending ALLOWANCE farther out. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds in half
-    the time.
+    Setpoints that end farther inside than `within` and ALLOWANCE in a coarse simulation are not simulated finely: they
+    count as ending ALLOWANCE farther out. Arguments as for link_loss_at_every_setpoint, whose worst moment this finds
+    in half the time.
     """
     return _simulate_sample(payloads, limits, rate, starts, within)
 
@@ -144,14 +144,14 @@ def link_loss_at_walls(
 def foreseen_link_loss(
     payloads: NDArray, limits: Limits, rate: float = RATE, starts: NDArray | None = None
 ) -> LinkLossMoments:
-    """Return an estimate of where the vehicle ends after each setpoint, from a first look at few of them."""
+    """Return an estimate of where the vehicle ends after each setpoint, by a coarse simulation."""
     return _foreseen(payloads, limits, rate, starts, _FORESEEN_EVERY)
 
 
 def link_loss_of_slow_motion(payloads: NDArray, limits: Limits, rate: float = RATE) -> LinkLossMoments:
     """Lose the link at setpoints of take-off, of the way to the start or of landing, (N, 29) uint8 at `rate`, Hz.
 
-    A first look at every eighth one suffices unless it ends near a wall.
+    A coarse simulation of every eighth one suffices unless it ends near a wall.
     """
     found, state = _foreseen(payloads, limits, rate, None, _SLOW_EVERY), decode(payloads)
     if found.worst.beyond < -_SLOW_ALLOWANCE:
@@ -169,7 +169,7 @@ def link_loss_within_stops(
 
     Each stop begins from a snapshot of its flight, `starts`, (L, K, 31) for each motor lag, as the moments of a plan
     hold them. Returns a moment for each fork, one stop after another; times are from the first setpoint of the stop.
-    If `coarsely`, by a first look, the vehicle ends at most ALLOWANCE farther out than returned.
+    If `coarsely`, the vehicle ends at most ALLOWANCE farther out than returned.
     """  # six, and what it is about
     rows = setpoint_rows(decode(stops.reshape(-1, PAYLOAD_SIZE))).reshape(*stops.shape[:2], SETPOINT_SIZE)
     some = slice(_middle(limits), _middle(limits) + 1) if coarsely else slice(None)
@@ -234,7 +234,7 @@ def _flown_each(rows: NDArray, limits: Limits, airframes: NDArray, rate: float, 
 
 
 def _foreseen(payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, every: int) -> LinkLossMoments:
-    """Return an estimate of where each setpoint ends, from a first look at one in `every`."""
+    """Return an estimate of where each setpoint ends, from a coarse simulation of one in `every`."""
     state, middle = decode(payloads), _middle(limits)
     rows, airframe = setpoint_rows(state), _airframes(limits)[middle : middle + 1]
     snapshots = _flown(rows, limits, airframe, rate, _begins(state, limits, starts)[middle : middle + 1])
@@ -258,7 +258,7 @@ def _simulate_coarsely(rows: NDArray, snapshots: NDArray, limits: Limits, every:
 def _simulate_sample(
     payloads: NDArray, limits: Limits, rate: float, starts: NDArray | None, within: float | None
 ) -> LinkLossMoments:
-    """Simulate closely the setpoints that may end `within` m of a wall, and the worst; None: that may end outside."""
+    """Simulate finely the setpoints that may end `within` m of a wall, and the worst; None: that may end outside."""
     state = decode(payloads)
     rows, number = setpoint_rows(state), np.arange(len(payloads))
     snapshots = _flown(rows, limits, _airframes(limits), rate, _begins(state, limits, starts))
@@ -277,7 +277,7 @@ def _simulate_sample(
 
 
 def _simulate_again(boxes: NDArray, rows: NDArray, snapshots: NDArray, limits: Limits, some: NDArray) -> None:
-    """Replace `some`, (N,) bool, of the boxes, (N, S, 2, 3), of a first look; `snapshots` are (L, N, 31)."""
+    """Replace `some`, (N,) bool, of the boxes, (N, S, 2, 3), of a coarse simulation; `snapshots` are (L, N, 31)."""
     boxes[some] = _swept(_Forks(rows, np.flatnonzero(some), snapshots[:, some], _airframes(limits)), limits)
 
 
@@ -288,7 +288,7 @@ class _Forks(NamedTuple):
     rows: NDArray  # (F,) int, the last setpoints
     snapshots: NDArray  # (L, F, 31) when they arrive
     airframes: NDArray  # (L, 26)
-    step: int = _STEP  # ms; a first look has _FIRST_STEP
+    step: int = _STEP  # ms; _FIRST_STEP in the coarse simulation
     parts: int = 0  # boxes of each sweep; 0: one, or _PARTS if there are obstacles
     part: int = PART  # ms of each box, if there are several
 
@@ -315,7 +315,7 @@ def _go_on(forks: _Forks, limits: Limits, error: float) -> NDArray:
 
 
 def _fall(forks: _Forks, limits: Limits) -> NDArray:
-    """Stop the motors at once; a first look uses both extremes of motor lag, though the flight before used one."""
+    """Stop the motors at once; the coarse simulation uses both extremes of motor lag, the flight before only one."""
     airframes = forks.airframes if forks.step == _STEP else _airframes(limits)[[0, -1]]
     snapshots = np.broadcast_to(forks.snapshots, (len(airframes), *forks.snapshots.shape[1:]))
     forks = forks._replace(snapshots=snapshots, airframes=airframes)
@@ -400,5 +400,5 @@ def _lags(limits: Limits) -> list[float]:
 
 
 def _middle(limits: Limits) -> int:
-    """Return the index of the motor lag of a first look."""
+    """Return the index of the coarse simulation's motor lag."""
     return len(_lags(limits)) // 2

@@ -1,6 +1,6 @@
 """Dry run of on-board pieces: polynomials flown by the simulated vehicle as its high-level commander flies them.
 
-It starts in hover where they begin. The commander evaluates them 100 times a second, as it decodes them, and hands the
+It starts in hover where they begin. The commander evaluates the decoded pieces 100 times a second, and passes the
 controller position, velocity, acceleration, yaw and body rates. Otherwise it is the dry run of streamed setpoints.
 """
 
@@ -16,7 +16,7 @@ from cfplan.simulation.engine.mellinger import ON_BOARD
 
 
 def on_board_run(flight: OnBoardTrajectory, limits: Limits) -> DryRun:
-    """Fly the pieces, and hover for SETTLING s behind them; deviations are from the plan, slowed as they are."""
+    """Fly the pieces, then hover for SETTLING s; deviations are from the plan, slowed like them."""
     pieces = flight.pieces
     times = np.arange(int(np.ceil((pieces.duration + SETTLING) * RATE))) / RATE
     rows = goal_rows(pieces, times)
@@ -31,7 +31,7 @@ def on_board_run(flight: OnBoardTrajectory, limits: Limits) -> DryRun:
 
 
 def goal_rows(pieces: Pieces, times: NDArray) -> NDArray:
-    """Return (N, 20): what the commander hands to the controller at times, (N,) s, as `mellinger` has setpoints."""
+    """Return (N, 20): the commander's goals for the controller at times, (N,) s, as `mellinger` has setpoints."""
     goals = goals_at(pieces, times)
     rows = np.zeros((len(times), SETPOINT_SIZE))
     rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = goals.position, goals.velocity, goals.acceleration

@@ -1,8 +1,8 @@
-"""Bodies that others have written, stepped as cfplan steps its own: RotorPy's, and those of drone-models.
+"""Third-party rigid bodies, RotorPy's and those of drone-models, with the interface of cfplan's own.
 
 Each takes a state as in `engine/layout.py`, (17,), and each motor's commanded thrust, (4,) N, and returns the
 state a while later. Both packages have rotor speeds where cfplan has thrusts; the curve of thrust over speed is known,
-so a thrust is as good as a speed.
+so they are equivalent.
 
 RotorPy: S. Folk, J. Paulos, V. Kumar, "RotorPy: A Python-based Multirotor Simulator with Aerodynamics for Education and
 Research", arXiv:2306.04485. drone-models: M. Rath, M. Schuck, first-principles model with parameters identified on
@@ -104,7 +104,7 @@ def rotorpy_body(airframe: Airframe, lag: float) -> BodyStep:
 
 def _rotorpy_parameters(airframe: Airframe, lag: float) -> dict[str, Any]:
     arm, (jx, jy, jz) = airframe.arm, airframe.inertia
-    places = np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]) * arm  # as motors are numbered, x forward
+    places = np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]]) * arm  # in the order of motors, x forward
     hover = (airframe.hover_thrust / THRUST_COEFFICIENT) ** 0.5
     return {
         "mass": airframe.mass, "Ixx": jx, "Iyy": jy, "Izz": jz, "Ixy": 0.0, "Ixz": 0.0, "Iyz": 0.0, "num_rotors": 4,
@@ -179,7 +179,7 @@ def _turning(quaternion: NDArray, rate: NDArray) -> NDArray:
 
 
 def _runge_kutta(derivative: Callable[[NDArray], NDArray], x: NDArray, step: float) -> NDArray:
-    """Step by the classical method of fourth order."""
+    """Step by the classical fourth-order Runge-Kutta method."""
     first = derivative(x)
     second = derivative(x + step / 2 * first)
     third = derivative(x + step / 2 * second)
@@ -189,7 +189,7 @@ def _runge_kutta(derivative: Callable[[NDArray], NDArray], x: NDArray, step: flo
 
 @contextmanager
 def _array_api() -> Iterator[None]:
-    """Set the flag without which drone-models refuses to be imported; only its numeric functions need what it does."""
+    """Set the flag that drone-models requires at import, though its numeric functions do not need it."""
     before = os.environ.get(_SCIPY_FLAG)
     os.environ[_SCIPY_FLAG] = "1"
     try:

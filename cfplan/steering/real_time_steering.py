@@ -1,4 +1,4 @@
-"""A steered flight in real time: by the pilot's and the planner's processes, attended to by threads of this one."""
+"""A steered flight in real time: by the pilot's and the planner's processes, served by threads of this one."""
 
 import contextlib
 import sys
@@ -26,8 +26,8 @@ from cfplan.vehicle.rotations import yaw_of
 
 PLANNER_GONE = "the planner's process has ended; the vehicle flies what is committed, and then hovers"
 _LISTEN_PERIOD = 0.05  # s
-_LANDING = 120.0  # s that landing may take
-_PLANNER_STARTS = 60.0  # s that its process may take, with compiling
+_LANDING = 120.0  # s, longest landing
+_PLANNER_STARTS = 60.0  # s, longest start of its process, with compiling
 
 
 class RealTimeSteering:
@@ -45,9 +45,9 @@ class RealTimeSteering:
         keys: bool,
         more_orders: Callable[[], Iterable[Order]] = tuple,
     ):
-        """Start the pilot's process, and a virtual vehicle's lab. `keys` says whether those of the terminal count.
+        """Start the pilot's process, and a virtual vehicle's lab. `keys`: read keys of the terminal.
 
-        Raises a CfplanError where vehicle or poses cannot be had.
+        Raises a CfplanError if vehicle or poses are not available.
         """
         self.outcome: FlightOutcome | CfplanError | None = None
         self._open = contextlib.ExitStack()
@@ -55,7 +55,7 @@ class RealTimeSteering:
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
         self._unanswered: set[int] = set()
-        self._fault: BaseException | None = None  # of the thread that hears the planner
+        self._fault: BaseException | None = None  # in the thread that listens to the planner
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
         try:

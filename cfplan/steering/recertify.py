@@ -1,9 +1,9 @@
-"""Certify a record again: everything that its pilot was ever bound to fly, and that this is what it streamed.
+"""Certify a record again: everything that its pilot was committed to, and that it streamed exactly this.
 
-Each plan that was committed is read from its file and certified anew, from the vehicle as it is simulated up to its
-splice: its limits, its bytes, a stop from each setpoint, link loss, gaps and the dry run. Its setpoints and stops must
-be those that the pilot verified, to the byte, and each setpoint streamed the one that was committed. Of a plan that was
-committed in parts, each part is.
+Each committed plan is read from its file and certified again, from the vehicle as simulated up to its splice: its
+limits, its bytes, a stop from each setpoint, link loss, gaps and the dry run. Its setpoints and stops must equal those
+that the pilot verified, to the byte, and each streamed setpoint the committed one. Plans that were committed in parts
+are certified part by part.
 """
 
 from contextlib import suppress
@@ -27,26 +27,26 @@ from cfplan.recording.record import PLAN_FILE, PLAN_IN_FLIGHT, Record
 from cfplan.safety.certificate import Certificate
 from cfplan.safety.limits import Limits
 
-YAW = "yaw"  # rad, in the provenance of a header: that of the hover in which a steered flight begins
-_SAME = 1e-6  # m, m/s, m/s², m/s³, that a motion may jump by at a joint
+YAW = "yaw"  # key of the initial yaw, rad, of a steered flight in a header's provenance
+_SAME = 1e-6  # m, m/s, m/s², m/s³, tolerated jump of the motion at a joint
 _RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)
 
 
 @dataclass(frozen=True, slots=True)
 class Recertified:
-    """What was certified again."""
+    """The result of certifying a record again."""
 
-    plans: int  # that were committed
-    stops: int  # that were asked for, and committed
-    certificate: Certificate | None  # of the plan that uses most of a limit; None where there is only a hover
-    joints: int  # between motions, none of which jumps
+    plans: int  # committed plans
+    stops: int  # requested and committed stops
+    certificate: Certificate | None  # of the plan with the largest usage; None for a hover only
+    joints: int  # joints without a jump
     jump: float  # the largest, in m, m/s, m/s² or m/s³
     committed: int  # setpoints, each with its stop
     streamed: int  # setpoints that were sent, each as committed
-    left_after: float | None  # s from setpoint 0, when a rung of the abort ladder was taken; None where none was
+    left_after: float | None  # s from setpoint 0, when a rung of the abort ladder was taken; None if none was
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return it for people."""
+        """Return rows of text."""
         left = f", until the plan was left after {self.left_after:.2f} s" if self.left_after is not None else ""
         worst = self.certificate.worst if self.certificate is not None else None
         share = f"{100 * worst.share:.1f} % of the limit on {worst.name}" if worst is not None else "a hover"
@@ -65,9 +65,9 @@ class Recertified:
 
 
 def recertify(record: Record) -> Recertified:
-    """Certify again what a record says was committed, and compare it with what was streamed.
+    """Certify a record's commitments again, and compare them with what was streamed.
 
-    Raises InputError where a plan's file is missing or damaged, NotCertifiedError where anything does not pass.
+    Raises InputError if a plan's file is missing or damaged, NotCertifiedError if anything fails.
     """
     commitments = record.commitments
     plans = [_plan_of(record, int(checksum)) for checksum in commitments.checksum[1:]]
@@ -103,7 +103,7 @@ def recertify(record: Record) -> Recertified:
 
 
 def _plan_of(record: Record, checksum: int) -> Plan | None:
-    """Return the plan of a proposal; None where the record has none, as that of a stop."""
+    """Return the plan of a proposal; None if the record has none, as for a stop."""
     file = record.folder / PLAN_IN_FLIGHT.format(checksum)
     return load_plan(file) if file.is_file() else None
 
@@ -127,7 +127,7 @@ def _beginning(record: Record, plans: list[Plan | None]) -> tuple[Timeline, Plan
 
 
 def _jump(timeline: Timeline, joint: float, plan: Plan) -> float:
-    """Return by how much position to jerk jump at a joint, s. Raises NotCertifiedError where they do."""
+    """Return by how much position to jerk jump at a joint, s. Raises NotCertifiedError if they do."""
     before, after = timeline.motion.at(joint), plan.trajectory.at(0.0)
     jumps = [
         float(np.abs(getattr(after, name) - getattr(before, name)).max())
@@ -147,7 +147,7 @@ def _committed(
 ) -> Replanned:
     """Certify a plan again, or another part of it, and return it.
 
-    Raises NotCertifiedError where it is something else.
+    Raises NotCertifiedError if it differs.
     """
     where = f"plan {number}, from setpoint {splice} on"
     committed = np.frombuffer(payloads, np.uint8).reshape(-1, PAYLOAD_SIZE)
@@ -175,10 +175,10 @@ def _committed(
 
 
 def _goes_on(onward: Onward, committed: NDArray, limits: Limits) -> bool:
-    """Return whether setpoints are more of the plan that is flown, and no stop."""
+    """Return whether setpoints continue the present plan, and are not a stop."""
     payloads = onward.encoded(limits).payloads
     following = len(committed) - STOP_AND_HOVER
-    if following < 2:  # a stop is as long, and begins like the plan; what is left of a plan is all of it
+    if following < 2:  # a stop is as long, and begins like the plan; a remainder is complete
         return np.array_equal(committed, payloads)
     return np.array_equal(committed[:following], payloads[:following])
 
@@ -202,7 +202,7 @@ def _stopped(
 def _compare(record: Record, sequence: NDArray) -> tuple[int, float | None]:
     """Return how many setpoints were streamed, each as committed, and when the plan was left, s.
 
-    Raises NotCertifiedError where one is another.
+    Raises NotCertifiedError if one differs.
     """
     phases, sent, events = record.phases, record.setpoints, record.events
     began = phases.time[phases.phase == Phase.STREAM]

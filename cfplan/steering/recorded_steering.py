@@ -1,4 +1,4 @@
-"""The record of a flight that is steered: begun before the take-off, with every plan that is committed in the air."""
+"""The record of a steered flight: begun before take-off, with every plan committed in the air."""
 
 import json
 from collections.abc import Callable
@@ -58,7 +58,7 @@ class SteeringRecord:
         self.tell(Event(now, Level.INFO, f"request {request.number}: {described(request.wish, request.waypoints)}"))
 
     def answered(self, answer: PathAnswer) -> None:
-        """Note an answer, and keep the plan behind it. What cannot be written shows in `failure`."""
+        """Note an answer, and keep the plan behind it. A write error shows in `failure`."""
         now = self._clock.now()
         self.tell(
             PathAnswered(
@@ -69,17 +69,17 @@ class SteeringRecord:
         level = Level.INFO if answer.verdict in (PathVerdict.ACCEPTED, PathVerdict.CHANGED) else Level.WARNING
         self.tell(Event(now, level, f"answer {answer.number}: {answer_text(answer)}"))
         if answer.plan is not None:
-            with suppress(CfplanError):  # `cfplan check` says that it is missing
+            with suppress(CfplanError):  # `cfplan check` reports it as missing
                 made_for = {"request": str(answer.number), "joint": repr(answer.joint), "splice": str(answer.splice)}
                 save_plan(answer.plan, self.folder / PLAN_IN_FLIGHT.format(answer.checksum), made_for)
 
     @property
     def failure(self) -> str:
-        """Return why what was to be written could not be, one line; empty where it was."""
+        """Return why something could not be written, one line; empty if nothing failed."""
         return self._writer.failure
 
     def close(self, outcome: FlightOutcome | None) -> tuple[Record, dict[str, Any]] | None:
-        """End it; return the record and its summary where there was a flight."""
+        """End the record; return it and its summary if there was a flight."""
         self._writer.close()
         if outcome is None:
             return None
@@ -91,7 +91,7 @@ class SteeringRecord:
 
 
 def described(wish: Wish, waypoints: tuple[Triple, ...]) -> str:
-    """Say what is asked for, in a line."""
+    """Describe a request in one line."""
     places = ", ".join(coordinates(waypoint, ".2f") for waypoint in waypoints)
     match wish:
         case Wish.EXTEND:
@@ -102,7 +102,7 @@ def described(wish: Wish, waypoints: tuple[Triple, ...]) -> str:
 
 
 def answer_text(answer: PathAnswer) -> str:
-    """Say what became of a request, in a line."""
+    """Describe the answer to a request in one line."""
     if answer.verdict not in (PathVerdict.ACCEPTED, PathVerdict.CHANGED):
         return f"{answer.verdict.value}: {answer.reason}" if answer.reason else answer.verdict.value
     if answer.splice < 0:

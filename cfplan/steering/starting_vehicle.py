@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from cfplan.simulation.lab.lab import StartingLab
 
 SIMULATED = "sim://"
-VIRTUAL_SUBJECT = "cf1"  # the only body that it sees
-VIRTUAL_VICON = "lab"  # as the computer in a URI of motion capture
-_OPEN_TIMEOUT = 10.0  # s for its first poses: it is there, but this computer may be busy
+VIRTUAL_SUBJECT = "cf1"  # the only body of the virtual Vicon
+VIRTUAL_VICON = "lab"  # host in its motion capture URI
+_OPEN_TIMEOUT = 10.0  # s for its first poses, as this computer may be busy
 
 
 def check_uris(uri: str, mocap_uri: str | None) -> None:
-    """Raise InputError where a URI is wrong, or a vehicle has no source of poses. Nothing is connected yet."""
+    """Raise InputError if a URI is wrong, or a vehicle has no source of poses. Nothing is connected yet."""
     from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
     from cfplan.flight.radio.uri import check_vehicle_uri
 
@@ -44,7 +44,7 @@ def check_uris(uri: str, mocap_uri: str | None) -> None:
 def look_at_hardware(uri: str, mocap_uri: str | None, limits: "PoseLimits", on_step: "OnStep") -> None:
     """Check, before anything is planned, that the radio is available, and the body seen, upright and in metres.
 
-    Says where the body is, which a person can check with a glance. Raises a CfplanError, within 5 s.
+    Reports the body's position, for a person to check. Raises a CfplanError, within 5 s.
     """
     from cfplan.flight.mocap.source import pose_source
     from cfplan.flight.radio.crazyradio import check_radio
@@ -98,7 +98,7 @@ class StartingVehicle:
         return launch_lab(self._limits.airframe, number=int(self.uri.removeprefix(SIMULATED)))
 
     def poses(self, on_step: "OnStep") -> "PoseSource":
-        """Wait for the lab where there is one; return the source of the vehicle's poses."""
+        """Wait for the lab if there is one; return the source of the vehicle's poses."""
         from cfplan.flight.mocap.source import pose_source
         from cfplan.flight.mocap.uri import parse_uri
 

@@ -1,9 +1,9 @@
 """A vehicle that a program steers: take off, fly through waypoints, change them in the air, land.
 
-Whatever the program asks for, or if it dies, the vehicle is bound to setpoints that end in a hover inside the space,
-each with a stop. A request is planned beside the flight, certified like a plan before take-off, and flown from a joint
-ahead of the vehicle without a stop between; where it cannot be, it is refused in words and the flight goes on as it
-was.
+Whatever the program requests, and even if it dies, the vehicle is committed to setpoints that end in a hover inside the
+space, each with a stop. A request is planned during the flight, certified like a plan before take-off, and flown from a
+joint ahead of the vehicle without a stop between; if that is impossible, it is refused with a reason and the flight
+continues unchanged.
 """
 
 import math
@@ -37,9 +37,9 @@ from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
 from cfplan.steering.recorded_steering import SteeringRecord, answer_text
 
-MOST_WAYPOINTS = 200  # of a request
+MOST_WAYPOINTS = 200  # per request
 _TAKE_OFF_TIMEOUT = 120.0  # s, preflight and its waits included
-PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which a planner does not answer
+PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which the planner counts as not answering
 _LAND_TIMEOUT = 120.0  # s
 _FLYING = (Phase.STREAM, Phase.HOLD)
 
@@ -48,7 +48,7 @@ class SteeredVehicle:
     """One flight of a vehicle; a context manager that lands and disarms the vehicle at its end.
 
     `cfplan.connect` makes it. Its methods raise a FlightEndedError once the flight has ended by anything but `land`:
-    by the operator's keys, by a safety rule, or because the link was lost; the error says which.
+    by the operator's keys, by a safety rule, or because the link was lost; the error has the reason.
     """
 
     def __init__(
@@ -77,23 +77,23 @@ class SteeredVehicle:
         self._closed = False
         self._recorded: tuple[Record, dict[str, Any]] | None = None
 
-    # What it knows.
+    # State.
 
     @property
     def position(self) -> Triple:
-        """Return where the vehicle was last seen, m; where it stands before the flight."""
+        """Return the last measured position, m; before the flight, where it stands."""
         return self._pose.position if self._pose is not None else self._flight.first_pose()[0]
 
     @property
     def target(self) -> Triple:
-        """Return where the vehicle is asked to be now, m, by its last setpoint. Raises InputError before take-off."""
+        """Return the position of the last setpoint, m. Raises InputError before take-off."""
         if self._sent is None:
             raise _not_flying()
         return self._sent.position
 
     @property
     def speed(self) -> float:
-        """Return how fast the vehicle is asked to fly now, m/s; 0 before take-off."""
+        """Return the speed of the last setpoint, m/s; 0 before take-off."""
         return math.hypot(*self._sent.velocity) if self._sent is not None else 0.0
 
     @property
@@ -103,25 +103,25 @@ class SteeredVehicle:
 
     @property
     def resting(self) -> bool:
-        """Return whether all that was asked for is flown, and the vehicle hovers."""
+        """Return whether all requests have been flown, and the vehicle hovers."""
         if self._phase not in _FLYING or self._sent is None or self._asked - self._answers.keys():
             return False
         return self._sent.time >= self._begun + self._ends
 
     @property
     def outcome(self) -> FlightOutcome | None:
-        """Return how the flight ended; None while it goes on, or where there was none."""
+        """Return how the flight ended; None during the flight, or if there was none."""
         ended = self._flight.outcome
         return ended if isinstance(ended, FlightOutcome) else None
 
     @property
     def record(self) -> Path | None:
-        """Return the folder of the flight's record; None before take-off, or where none is written."""
+        """Return the folder of the flight's record; None before take-off, or if none is written."""
         return self._recording.folder if self._recording is not None else None
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Return what `cfplan report` says of the record, once the flight is over; empty where there is none."""
+        """Return the figures of `cfplan report`, once the flight is over; empty if there is no record."""
         return self._recorded[1] if self._recorded is not None else {}
 
     # The flight.
@@ -167,31 +167,31 @@ class SteeredVehicle:
         return self.replace(waypoints)
 
     def extend(self, waypoints: ArrayLike) -> PathAnswer:
-        """Fly on through waypoints, (K, 3) m, after those ahead, without a stop between. As `replace` otherwise."""
+        """Fly on through waypoints, (K, 3) m, after those ahead, without a stop between. Otherwise like `replace`."""
         return self.ask(Wish.EXTEND, waypoints)
 
     def replace(self, waypoints: ArrayLike) -> PathAnswer:
         """Leave what is ahead at the next joint, and fly through waypoints, (K, 3) m, to rest at the last.
 
-        Returns once the pilot is bound to it, while the vehicle flies on. Raises InputError where these are no
-        waypoints, RequestRefusedError where no certified plan leads through them or it came too late.
+        Returns once the pilot is committed to it, while the vehicle flies on. Raises InputError for invalid waypoints,
+        RequestRefusedError if no certified plan leads through them or it came too late.
         """
         return self.ask(Wish.REPLACE, waypoints)
 
     def stop(self) -> PathAnswer:
-        """Come to rest soon, ahead on the path. Raises RequestRefusedError where what is committed ends as soon."""
+        """Come to rest soon, ahead on the path. Raises RequestRefusedError if the committed motion ends as soon."""
         return self.ask(Wish.STOP)
 
     def slower(self) -> PathAnswer:
-        """Fly what is ahead, and what is asked for later, at three quarters of the speed. As `replace` otherwise."""
+        """Fly the rest, and later requests, at three quarters of the speed. Otherwise like `replace`."""
         return self.ask(Wish.SLOWER)
 
     def faster(self) -> PathAnswer:
-        """Undo `slower`, as often as it was asked for. As `replace` otherwise."""
+        """Undo one `slower`. Otherwise like `replace`."""
         return self.ask(Wish.FASTER)
 
     def ask(self, wish: Wish, waypoints: ArrayLike = ()) -> PathAnswer:
-        """Ask for a change, wait for its answer, and return it. Raises as `replace` does."""
+        """Request a change, wait for its answer, and return it. Raises like `replace`."""
         answer = self.answer_to(self.request(wish, waypoints))
         if answer.verdict is not PathVerdict.ACCEPTED:
             raise RequestRefusedError(
@@ -200,9 +200,9 @@ class SteeredVehicle:
         return answer
 
     def request(self, wish: Wish, waypoints: ArrayLike = ()) -> int:
-        """Ask for a change and return at once, with the number of its answer.
+        """Request a change and return at once, with the number of its answer.
 
-        The latest request wins: one that waits to be planned is superseded. Raises InputError where these are no
+        The latest request wins: one that waits to be planned is superseded. Raises InputError for invalid
         waypoints.
         """
         self._require_flying()
@@ -214,7 +214,7 @@ class SteeredVehicle:
         return number
 
     def answer_to(self, number: int) -> PathAnswer:
-        """Wait for the answer to a request and return it; where the planner does not answer, one that says so."""
+        """Wait for the answer to a request and return it; if the planner does not answer, one that says so."""
         self._flight.wait(lambda: number in self._answers, PLANNER_ANSWER_TIMEOUT)
         answer = self._answers.get(number)
         if answer is None:
@@ -225,7 +225,7 @@ class SteeredVehicle:
         return answer
 
     def answers(self) -> list[PathAnswer]:
-        """Return the answers since the last call, but for those that were waited for."""
+        """Return the answers since the last call, except those that were waited for."""
         unread, self._unread = self._unread, []
         return unread
 
@@ -237,7 +237,7 @@ class SteeredVehicle:
         return self._flight.typed()
 
     def wait(self, patience: float = math.inf) -> bool:
-        """Wait until all that was asked for is flown and the vehicle hovers, at most for `patience`, s.
+        """Wait until all requests have been flown and the vehicle hovers, for at most `patience`, s.
 
         Returns whether it does.
         """
@@ -255,9 +255,9 @@ class SteeredVehicle:
             self._flight.wait(lambda: self.time >= until, min(until - self.time, 1.0))
 
     def land(self) -> None:
-        """Stop along the path where the vehicle still moves, land, disarm, and return when that is done.
+        """Stop along the path if the vehicle still moves, land, disarm, and return when that is done.
 
-        Raises a FlightEndedError where a safety rule or the operator ended the flight instead.
+        Raises a FlightEndedError if a safety rule or the operator ended the flight instead.
         """
         self._end(Order.FINISH if self.resting else Order.LAND)
         ended = self._flight.outcome
@@ -267,12 +267,12 @@ class SteeredVehicle:
             raise _ended(ended)
 
     def finish(self) -> None:
-        """Fly what is committed to its end, then land, disarm, and return. Raises as `land` does."""
+        """Fly the committed motion to its end, then land, disarm, and return. Raises like `land`."""
         self._end(Order.FINISH, self._ends + _LAND_TIMEOUT)
         self.land()
 
     def cut(self) -> None:
-        """Cut the motors at once, wherever the vehicle is: it falls. Afterwards it does not take off."""
+        """Cut the motors at once, at any height: the vehicle falls. It cannot take off afterwards."""
         self._end(Order.CUT)
 
     def close(self) -> None:
@@ -298,10 +298,10 @@ class SteeredVehicle:
         finally:
             self.close()
 
-    # Within.
+    # Internal.
 
     def _end(self, order: Order, patience: float = _LAND_TIMEOUT) -> None:
-        """Give an order that ends the flight, and wait until it has ended. Raises LinkError where it does not."""
+        """Give an order that ends the flight, and wait until it has ended. Raises LinkError if it does not."""
         if self._flight.outcome is not None:
             return
         if self._started or order is Order.CUT:
@@ -332,7 +332,7 @@ class SteeredVehicle:
         if math.isfinite(answer.ends):
             self._ends = answer.ends
         brief = replace(answer, plan=None)
-        if answer.verdict is not PathVerdict.CHANGED:  # that comes behind the answer
+        if answer.verdict is not PathVerdict.CHANGED:  # that follows the answer
             self._answers[answer.number] = brief
         self._unread.append(brief)
         if self._recording is not None:
@@ -349,7 +349,7 @@ class SteeredVehicle:
 
 
 def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
-    """Return waypoints as rows of x, y, z, m. Raises InputError where they are none."""
+    """Return waypoints as rows of x, y, z, m. Raises InputError if they are invalid."""
     hint = "give rows of x, y, z in metres, as [[1, 0, 1], [0, 1, 1.2]]"
     try:
         points = np.array(waypoints, dtype=float)

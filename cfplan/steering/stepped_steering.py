@@ -1,6 +1,6 @@
 """A steered flight on a stepped clock: the virtual vehicle, whose time passes only while the program waits.
 
-The pilot's code runs in a thread that takes turns with the program's: whoever does not wait stands still. So a program
+The pilot's code runs in a thread that takes turns with the program's: the other one stands still. So a program
 flies the same on every run, however fast the computer is, and minutes of flight take seconds.
 """
 
@@ -25,7 +25,7 @@ from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.steering.flight_in_progress import Listeners
 from cfplan.vehicle.rotations import yaw_of
 
-_LANDING = 120.0  # s that landing may take
+_LANDING = 120.0  # s, longest landing
 
 
 class SteppedSteering:

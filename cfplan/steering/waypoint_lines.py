@@ -5,8 +5,8 @@
     stop | slower | faster | land | cut
 
 Each line is answered by one that begins with its number. Waypoints that wait together are planned together. A line that
-cannot be flown, or is no such line, is refused in words, and the flight goes on as it was. The lines `land` and `cut`
-count as soon as they are read, before all lines that still wait.
+cannot be flown, or is invalid, is refused with a reason, and the flight continues unchanged. The lines `land` and `cut`
+take effect as soon as they are read, before all waiting lines.
 """
 
 import contextlib
@@ -64,7 +64,7 @@ class LineSource(Protocol):
     ending: bool  # whether a line has ordered to land or to cut; lines that still wait are then refused
 
     def next(self, patience: float) -> TextLine | None:
-        """Return the next line, waiting for it for `patience`, s; None where none came. Raises EOFError at the end."""
+        """Return the next line, waiting for it for `patience`, s; None if there is none. Raises EOFError at the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class _Asked:
 
 
 def order_of(text: str) -> Order | None:
-    """Return the order that a line gives, None if it gives none."""
+    """Return the order in a line, None if there is none."""
     return _ORDERS.get(text.strip().lower())
 
 
@@ -239,7 +239,7 @@ class QueuedLines:
                 self.take(line, reply)
 
     def end(self) -> None:
-        """Say that no more lines come."""
+        """Mark the end of the lines."""
         self._queue.put(None)
 
 
@@ -327,7 +327,7 @@ def _remove_left_over(path: Path) -> None:
 
 
 def _serve(server: socket.socket, lines: QueuedLines) -> None:
-    """Read the lines of one client at a time; another is refused in words. One that vanishes changes nothing."""
+    """Read the lines of one client at a time; another is refused. A client that vanishes changes nothing."""
     busy = threading.Lock()
     while server.fileno() >= 0:
         try:

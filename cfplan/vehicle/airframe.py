@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-GRAVITY = 9.81  # m/s², as the firmware has it
+GRAVITY = 9.81  # m/s², as in the firmware
 
 # Motors 1 front right, 2 back right, 3 back left, 4 front left: the sign of each motor's torque about x, y, z.
 MOTOR_TORQUE_SIGNS = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]], dtype=float)
@@ -18,7 +18,7 @@ MOTOR_TORQUE_SIGNS = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]], 
 class Spread:
     """Spread of vehicles of one kind around their airframe: half the width of the 95 % interval, as fractions.
 
-    Of public flights of four vehicles, and of one vehicle from flight to flight.
+    From public flights of four vehicles, and from repeated flights of one vehicle.
     """
 
     mass: float = 0.02  # decks and markers
@@ -47,7 +47,7 @@ class Airframe:
     velocity_moment: tuple[float, float] = (0.0, 0.0)
     """N m per m/s, moment about x by velocity along y, and about -y by velocity along x, in body axes."""
     thrust_scale: float = 1.0
-    """Actual over commanded thrust in hover; the controller is told, so that it commands less of a strong vehicle."""
+    """Actual over commanded thrust in hover; the controller knows it and commands less of a strong vehicle."""
     thrust_curvature: float = 0.0
     """Fraction by which thrust around hover grows more slowly than in proportion to the command."""
     lift_with_speed: float = 0.0
@@ -65,15 +65,15 @@ class Airframe:
 
     @property
     def thrust_range(self) -> tuple[float, float]:
-        """Return the thrusts of one motor, N, between which plans lie.
+        """Return the thrust range of one motor, N, for planning.
 
-        A thrust scale is known in hover alone: one below 1 lowers the most, one above 1 does not raise it.
+        The thrust scale is only known in hover: one below 1 lowers the maximum, one above 1 does not raise it.
         """
         return self.motor_thrust_min * max(self.thrust_scale, 1.0), self.motor_thrust_max * min(self.thrust_scale, 1.0)
 
     @property
     def command_per_thrust(self) -> float:
-        """Return 16-bit units of a motor's command per N of collective thrust: what ctrlMel.massThrust should be."""
+        """Return 16-bit units of a motor's command per N of collective thrust, the value for ctrlMel.massThrust."""
         return 65535 / (4 * self.motor_thrust_max * self.thrust_scale)
 
     @property
@@ -83,7 +83,7 @@ class Airframe:
         return np.vstack([np.ones(4), levers[:, None] * MOTOR_TORQUE_SIGNS])
 
     def simplified(self) -> "Airframe":
-        """Return it without what real flights add to the bodies of RotorPy and drone-models."""
+        """Return the airframe without effects that the bodies of RotorPy and drone-models lack."""
         return replace(
             self, velocity_moment=(0.0, 0.0), thrust_scale=1.0, thrust_curvature=0.0, lift_with_speed=0.0,
             voltage_sag=0.0,
@@ -93,14 +93,14 @@ class Airframe:
 UNPLANNED = frozenset(
     ("velocity_moment", "thrust_scale", "thrust_curvature", "lift_with_speed", "voltage_sag", "motor_curve", "spread")
 )
-"""Fields that datasets do not hold: networks see none of them."""
+"""Fields that datasets, and so networks, do not have."""
 
 
 def airframe_of(values: Mapping[str, Any]) -> Airframe:
     """Return the airframe of plain data as `asdict` makes it; null is NaN.
 
-    Fields of later versions are ignored, those that earlier ones lacked keep their defaults. Raises KeyError,
-    TypeError, ValueError or AttributeError where the data are those of no airframe.
+    Fields of later versions are ignored, missing ones keep their defaults. Raises KeyError, TypeError, ValueError or
+    AttributeError if the data are not an airframe.
     """
     given: dict[str, Any] = {}
     for each in fields(Airframe):

@@ -9,7 +9,7 @@ from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import read_yaml_with_places
 from cfplan.vehicle.airframe import Airframe, Spread, airframe_of
 
-# Bounds far beyond what flies indoors: beyond them digits would be lost, or a unit is wrong.
+# Bounds far beyond vehicles that fly indoors; larger values would lose digits, or have a wrong unit.
 Inertia = Annotated[float, Field(ge=1e-8, le=1.0)]
 Fraction = Annotated[float, Field(ge=0.0, le=1.0)]
 Coefficient = Annotated[float, Field(ge=-10.0, le=10.0)]

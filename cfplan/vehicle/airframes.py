@@ -10,8 +10,9 @@ Sources:
 A thrust scale belongs to a motor curve. That of the 2.1+ is by the PWM and battery voltage of 2.1s with decks: 1.04 by
 the curve of firmware 2026.08, without curvature; 1.02 to 1.09 in the hover of four flights. The upgrade's logs (1.5
 times the thrust that a firmware without its curve commands) have no voltage. By the curve of 2026.08 the brushless logs
-show 1.3 to 1.4 with a slope of 1.7: they are of other propellers. The scale of these two is 1 until a hover says more.
-Motor lags are those of `models`: flights show 0.07 to 0.10 s and 0.035 to 0.055 s, which changes nothing sideways.
+show 1.3 to 1.4 with a slope of 1.7: they are of other propellers. The scale of these two is 1 until it is measured in
+hover. Motor lags are those of `models`: flights show 0.07 to 0.10 s and 0.035 to 0.055 s, which changes nothing
+sideways.
 
 Where `models` gives rotor dynamics n' = k₁(u − n) + k₂(u² − n²), up and down apart, the time constant here is the mean
 of 1/(k₁ + 2k₂n) of both at the hover speed n: to first order thrust lags as the rotor speed does. The rotor reaction is
@@ -45,7 +46,7 @@ AIRFRAMES = MappingProxyType(
                 thrust_to_torque=7.8e-10 / 2.3e-8,  # k_m / k_eta; four times what was measured on the 2.1+
                 motor_thrust_min=0.0,
                 motor_thrust_max=2.3e-8 * 2500.0**2,  # k_eta · rotor_speed_max², 0.14375 N
-                motor_time_constant=0.072,  # Eschmann et al. (2024); RotorPy had 0.005 s in the paper's day
+                motor_time_constant=0.072,  # Eschmann et al. (2024); RotorPy had 0.005 s when the paper was written
                 drag=(4 * 1.02506e-6 * _ROTORPY_HOVER, 4 * 7.553e-7 * _ROTORPY_HOVER),  # k_d and k_z at hover
                 source="RotorPy 3.0.0, as the paper used it but for the motor time constant (0.005 s then)",
             ),
@@ -109,7 +110,7 @@ def load_airframe(name_or_file: str | Path) -> Airframe:
     if text in AIRFRAMES:
         return AIRFRAMES[text]
     if isinstance(name_or_file, Path) or text.endswith((".yaml", ".yml")):
-        from cfplan.vehicle.airframe_file import read_airframe  # pydantic takes its time to import
+        from cfplan.vehicle.airframe_file import read_airframe  # pydantic is slow to import
 
         return read_airframe(text)
     near = difflib.get_close_matches(text, AIRFRAMES, n=1)

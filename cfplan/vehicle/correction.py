@@ -1,8 +1,8 @@
-"""Correction of a plan: a shift of what a vehicle is asked to fly, by what it strayed in earlier flights of it.
+"""Correction of a plan: a shift of its positions by the repeated deviation of earlier flights.
 
-The shift is a B-spline over the plan's time, constant with four derivatives at both ends. A trajectory with it is a
-trajectory again, along γ(s) + δ(t(s)) by the same profile: all that certifies, encodes and flies trajectories does so
-with a corrected one.
+The shift is a B-spline over the plan's time, constant with four derivatives at both ends. A corrected
+trajectory is again a trajectory, along γ(s) + δ(t(s)) with the same profile, so it is certified, encoded and flown like
+any other.
 """
 
 from dataclasses import dataclass
@@ -16,19 +16,19 @@ from cfplan.geometry.polynomials import hermite, padded, shifted
 from cfplan.vehicle.profile import ProfileSample
 from cfplan.vehicle.trajectory import Trajectory
 
-DEGREE = 5  # so that the fourth derivative is continuous, as snap makes angular acceleration
+DEGREE = 5  # for a continuous fourth derivative, as snap determines angular acceleration
 _ORDERS = 5  # the shift and four derivatives
-_AT_REST = DEGREE - 1  # copies of a coefficient beyond an end, for which the spline is constant there
-_LONGEST_PIECE = 0.1  # s, in which a polynomial of degree 9 is within 1e-7 m of the shift
-_SAME = 1e-9  # share of a path's s, nearer than which two ends of pieces are one
+_AT_REST = DEGREE - 1  # copies of a coefficient beyond an end, which make the spline constant there
+_LONGEST_PIECE = 0.1  # s, within which a polynomial of degree 9 approximates the shift to 1e-7 m
+_SAME = 1e-9  # fraction of a path's s, within which two ends of pieces coincide
 _HERMITE = hermite(_ORDERS)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanCorrection:
-    """A shift over the time of a plan; before its start and after its end the shift stays what it is there.
+    """A shift over the time of a plan, constant before its start and after its end.
 
-    Raises InputError where there is no coefficient, or a number that is not finite, or no duration.
+    Raises InputError if there is no coefficient, a number is not finite, or the duration is not positive.
     """
 
     coefficients: NDArray  # (J, 3) m, of B-splines of DEGREE with evenly spaced knots
@@ -61,8 +61,8 @@ def knots_of(duration: float, count: int) -> NDArray:
 def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: float) -> PlanCorrection:
     """Return the correction nearest to shifts, (N, 3) m at times, (N,) s, with knots about `spacing`, s, apart.
 
-    That is a low-pass without phase: what is faster than 1 / (2 spacing) is left out. Each two neighbours of the times
-    must be nearer than the spacing.
+    This is a low-pass filter without phase shift, with a cut-off frequency of 1 / (2 spacing). Neighbouring times must
+    be closer than the spacing.
     """
     from scipy.interpolate import BSpline
 
@@ -79,7 +79,7 @@ def fit_correction(times: NDArray, shifts: NDArray, duration: float, spacing: fl
 def corrected(trajectory: Trajectory, correction: PlanCorrection) -> Trajectory:
     """Return the trajectory along the shifted path, with the same speed profile and yaw.
 
-    Raises InputError where the correction is of a plan of another duration.
+    Raises InputError if the correction is for a plan of another duration.
     """
     if abs(correction.duration - trajectory.duration) > _SAME * trajectory.duration:
         raise InputError(
@@ -100,7 +100,7 @@ def corrected(trajectory: Trajectory, correction: PlanCorrection) -> Trajectory:
     of_grid = np.clip(np.searchsorted(grid, middle) - 1, 0, len(shift) - 1)
     count = max(2 * _ORDERS, path.coefficients.shape[1])
     table = shifted(padded(shift[of_grid], count), origins - grid[of_grid])
-    table[[0, -1], 1:_ORDERS] = 0.0  # but for rounding
+    table[[0, -1], 1:_ORDERS] = 0.0  # up to rounding
     table += shifted(padded(path.coefficients[of_path], count), origins - path.origins[of_path])
     return Trajectory(Path(breaks, table), trajectory.profile, trajectory.airframe)
 
@@ -109,7 +109,7 @@ def _grid(trajectory: Trajectory) -> tuple[NDArray, NDArray]:
     """Return the ends of the polynomials of the shift, (M + 1,) s of the path, and the profile's interval of each."""
     s = trajectory.profile.s
     parts = np.maximum(np.ceil(np.diff(trajectory.time_at(s)) / _LONGEST_PIECE).astype(int), 1)
-    parts[0] = max(parts[0], 3 - len(parts))  # a path has two pieces at least
+    parts[0] = max(parts[0], 3 - len(parts))  # a path has at least two pieces
     inner = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(s[:-1], s[1:], parts, strict=True)]
     return np.append(np.concatenate(inner), trajectory.path.end), np.repeat(np.arange(len(parts)), parts)
 

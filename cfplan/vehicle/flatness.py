@@ -1,7 +1,7 @@
 """Differential flatness: path derivatives, speed profile and yaw to the full state and the motor thrusts.
 
-Written once, in plain arithmetic on the components of vectors, so that numbers compiled by numba (trajectory,
-certificate) and CasADi symbols (expert) go through the same equations. Equations: docs/architecture.md, "The
+Written in scalar arithmetic, so that the same equations serve numba (trajectory, certificate) and CasADi symbols
+(expert). Equations: docs/architecture.md, "The
 mathematics"; body rates of the Hopf fibration after Watterson and Kumar, "Control of quadrotors using the Hopf
 fibration on SO(3)" (2017); drag after Faessler, Franchi and Scaramuzza (2018), exact here because drag is equal along
 body x and y.
@@ -98,8 +98,8 @@ def flat_state(
     jerk = _scaled(speed, acceleration_ds)
     snap = _sum2(h0, acceleration_dds, 0.5 * h1, acceleration_ds)
 
-    # Force over mass that the rotors must give: drag along body x and y is that of the whole velocity, and what
-    # drag along the thrust axis differs by only changes the collective thrust.
+    # Force over mass of the rotors: with the drag coefficient of body x and y for the whole velocity; the difference
+    # of the coefficient along the thrust axis only changes the collective thrust.
     drag, axial_drag = airframe.drag[0] / airframe.mass, airframe.drag[1] / airframe.mass
     force = _sum2(1.0, acceleration, drag, velocity)
     force = (force[0], force[1], force[2] + GRAVITY)
@@ -133,7 +133,7 @@ def _turning(
 ) -> tuple[Vector, Vector]:
     """Return body rate and angular acceleration.
 
-    `axes` are the thrust axis and its first two derivatives in time, `heading` is (cos ψ, sin ψ) and `turn` those of ψ.
+    `axes` are the thrust axis and its first two time derivatives, `heading` is (cos ψ, sin ψ), `turn` holds those of ψ.
     """
     (a, b, c), (a1, b1, c1), (a2, b2, c2) = axes
     (cos_psi, sin_psi), (psi_dt, psi_ddt) = heading, turn
@@ -167,7 +167,7 @@ def _velocity_across(axis: Vector, heading: tuple[Scalar, Scalar], velocity: Vec
 def _torque(
     airframe: Airframe | Body, body_rate: Vector, angular_acceleration: Vector, velocity: tuple[Scalar, Scalar]
 ) -> Vector:
-    """Return the torque of the motors, N m, beside the moment of the air, which is as the velocity along body x, y."""
+    """Return the torque of the motors, N m; the air adds a moment in proportion to the velocity along body x, y."""
     jx, jy, jz = airframe.inertia
     (wx, wy, wz), (about_x, about_y) = body_rate, airframe.velocity_moment
     return (
@@ -197,7 +197,7 @@ def motor_thrusts(
 
 
 def compiled_body(airframe: Airframe) -> Body:
-    """Return the airframe for compiled code, which takes floats alone."""
+    """Return the airframe for compiled code, which takes only floats."""
     (jx, jy, jz), (planar, axial), (about_x, about_y) = airframe.inertia, airframe.drag, airframe.velocity_moment
     return Body(
         float(airframe.mass), (float(jx), float(jy), float(jz)), float(airframe.arm),

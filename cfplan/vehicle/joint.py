@@ -1,8 +1,8 @@
-"""Joint: where another trajectory takes over from one that is flown, without a jump; and trajectories so joined.
+"""Joint: the state at which one trajectory continues another without a jump; and joined trajectories.
 
-The one taking over begins with γ to γ'''' and the boundary state (h, h', h'', ψ, ψ') of the one left, in its unit of s.
+The second trajectory begins with γ to γ'''' and the boundary state (h, h', h'', ψ, ψ') of the first, in its unit of s.
 Position, velocity, acceleration, jerk, attitude and body rates are then continuous; only snap, and with it angular
-acceleration and motor thrust, may jump by what h''' and ψ'' jump, as at every grid point of a profile.
+acceleration and motor thrust, may jump, as h''' and ψ'' do at every grid point of a profile.
 """
 
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from cfplan.vehicle.trajectory import FullState, Trajectory
 class Joint:
     """The state of a trajectory at a moment, from which another continues."""
 
-    time: float  # s, of the trajectory left
-    s: float  # likewise, where on its path
+    time: float  # s, of the first trajectory
+    s: float  # position on its path
     derivatives: NDArray  # (5, 3) γ to γ''''
     state: BoundaryState
 
     def timed(self, trajectory: Trajectory, rate: float) -> "Joint":
-        """Return the same state of the trajectory left in another unit of s: time, `rate` units a second.
+        """Return the same state with time as s, in `rate` units per second.
 
-        Then h is the square of `rate` and stands still, and γ' to γ'''' are what the vehicle has of velocity to snap.
+        Then h is the constant square of `rate`, and γ' to γ'''' are the vehicle's velocity to snap in these units.
         """
         moving = trajectory.at(self.time)
         derivatives = np.array([moving.position, moving.velocity, moving.acceleration, moving.jerk, moving.snap])
@@ -55,12 +55,12 @@ def joint_at(trajectory: Trajectory, time: float) -> Joint:
     return Joint(float(time), s, derivatives, state)
 
 
-LOOK_BACK = 0.05  # s; setpoints are made of rates that were planned up to 0.03 s before (RATE_LEAD)
+LOOK_BACK = 0.05  # s; setpoints use rates planned up to 0.03 s earlier (RATE_LEAD)
 
 
 @dataclass(frozen=True, slots=True)
 class JoinedTrajectory:
-    """Trajectories on one clock, each flown from its start until that of the next; the last one to its end."""
+    """Trajectories on one clock, each flown until the start of the next, the last one to its end."""
 
     trajectories: tuple[Trajectory, ...]
     starts: tuple[float, ...]  # s, on the common clock, ascending
@@ -95,7 +95,7 @@ class JoinedTrajectory:
         return state if times.ndim else state.rows(0)
 
     def since(self, time: float) -> "JoinedTrajectory":
-        """Return the same flight on a clock that is 0 at `time`, s, without what is flown LOOK_BACK before."""
+        """Return the same flight on a clock that is 0 at `time`, s, without parts that ended LOOK_BACK before."""
         first = self._index_at(time)
         return JoinedTrajectory(self.trajectories[first:], tuple(start - time for start in self.starts[first:]))
 

@@ -1,8 +1,7 @@
-"""Measures: the numbers of a full state that limits bind, by one function body for numpy, numba and CasADi alike.
+"""Measures: the limited values of a full state, by one function body for numpy, numba and CasADi.
 
-All of them are smooth where path and profile are, which norms and angles near zero are not: squares stand for norms,
-the squared tangent of half the tilt for the tilt. safety/quantities.py says what each is called, in which unit, and
-which limit binds it.
+All of them are smooth wherever path and profile are, unlike norms and angles near zero: squares replace norms, and the
+squared tangent of half the tilt replaces the tilt. safety/quantities.py has the name, unit and limit of each.
 """
 
 import math
@@ -20,8 +19,8 @@ ACCELERATION, BODY_RATE = 0, 1  # squared: m²/s⁴, rad²/s²
 TILT = 2  # squared tangent of half the angle between thrust axis and vertical
 SPECIFIC_THRUST = 3  # m/s²
 ANGULAR_ACCELERATION = 4  # squared: rad²/s⁴
-MOTOR_THRUST = 5  # N, and the three behind
-SPEED = 9  # squared: m²/s²; the last, as planners bind it by h alone
+MOTOR_THRUST = 5  # N, and the next three
+SPEED = 9  # squared: m²/s²; the last, as planners bound it through h
 MEASURES = 10
 
 
@@ -61,7 +60,7 @@ def measures_of(
     angular_acceleration: NDArray | None = None,
     motor_thrust: NDArray | None = None,
 ) -> NDArray:
-    """Return (MEASURES, ...) of full states: vectors (..., 3), motor thrusts (..., 4); NaN where one is not known."""
+    """Return (MEASURES, ...) of full states: vectors (..., 3), motor thrusts (..., 4); NaN if unknown."""
     unknown: Any = (np.full(np.shape(specific_thrust), np.nan),) * 4
 
     def parts(vector: NDArray | None) -> Any:
@@ -87,7 +86,7 @@ def measures_of(
 
 @njit(error_model="numpy", fastmath=ROUNDING)
 def measures_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: NDArray, force: NDArray) -> NDArray:
-    """Return (MEASURES, N) of what instants tell, (N, 3) each; NaN where one is not known.
+    """Return (MEASURES, N) of instantaneous motion, (N, 3) each; NaN if unknown.
 
     `force`, m/s², is the thrust over mass, as a vector.
     """
@@ -101,7 +100,7 @@ def measures_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: ND
 
 @njit(error_model="numpy", fastmath=ROUNDING)
 def extremes_at_instants(velocity: NDArray, acceleration: NDArray, body_rate: NDArray, force: NDArray) -> NDArray:
-    """Return the largest and the least, (2, MEASURES), of what measures_at_instants() gives; NaN where one is NaN."""
+    """Return the largest and the least, (2, MEASURES), of measures_at_instants(); NaN propagates."""
     out = np.empty((2, MEASURES))
     for n in range(len(force)):
         values = _at_instant(velocity, acceleration, body_rate, force, n)

@@ -1,7 +1,7 @@
-"""Motion at many points of a path: the measures that limits bind, or the full state, by the flatness map.
+"""Motion at many points of a path: limited measures, or the full state, by the flatness map.
 
-Points are taken side by side, up to WIDTH at a time, some 10 to 20 ns each. A panel holds rows of one quantity each, in
-one array whose size the compiler knows where it is used, so that it works on several points with one instruction.
+Up to WIDTH points are processed together, in some 10 to 20 ns each. A panel is one array with a row per quantity, whose
+size the compiler knows, so that it vectorises over points.
 """
 
 import numpy as np

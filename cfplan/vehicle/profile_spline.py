@@ -4,8 +4,8 @@ On a grid of N intervals the spline has N+3 coefficients, c₋₁ to c_N+1. With
 
     h = (c₋ + 4c + c₊)/6,   h'Δs = (c₊ - c₋)/2,   h''Δs² = c₋ - 2c + c₊       with c = c_n, c₋ and c₊ its neighbours
 
-and h'''Δs³ is their third difference in the interval. h lies between the least and the largest coefficient. Of yaw, a
-quadratic spline on the same grid, yaw_spline.py has the same.
+and h'''Δs³ is their third difference in the interval. h lies between the least and the largest coefficient.
+yaw_spline.py does the same for yaw, a quadratic spline on the same grid.
 """
 
 import numpy as np
@@ -84,7 +84,7 @@ def node_values(before: Scalar, here: Scalar, after: Scalar) -> tuple[Scalar, Sc
 
 
 def weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Return what each of an interval's four coefficients weighs in h at a place from 0 to 1 within it."""
+    """Return the weights in h of an interval's four coefficients, at a place from 0 to 1 within it."""
     x = place
     return (
         (1 - x) ** 3 / 6,
@@ -95,7 +95,7 @@ def weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar, Scalar]:
 
 
 def _quadratic_weights_at(place: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return the same of the three coefficients of a quadratic spline."""
+    """Return the weights of the three coefficients of a quadratic spline, likewise."""
     return (1 - place) ** 2 / 2, (1 + 2 * place - 2 * place**2) / 2, place**2 / 2
 
 
@@ -105,8 +105,8 @@ def profile_through(
     """Return the profile on `grid`, (N+1,) uniform, nearest to h and yaw, both (K,), at s, (K,) ascending.
 
     Errors of h count relative to h. The stiffnesses weigh the squared jumps of h''' (relative to h) and of ψ'' between
-    the intervals, in units of one interval, against the mean squared error. Where samples are sparse a little
-    stiffness is what fills in.
+    the intervals, in units of one interval, against the mean squared error. Where samples are sparse, a little
+    stiffness fills in.
     """
     turning = _fit(grid, s, yaw, np.ones_like(yaw), 2, yaw_stiffness)
     track = YawSpline.from_coefficients(turning, grid[1] - grid[0])
@@ -114,7 +114,7 @@ def profile_through(
 
 
 def speed_through(grid: NDArray, s: NDArray, h: NDArray, yaw: YawSpline, *, stiffness: float = 0.0) -> SpeedProfile:
-    """Return what profile_through() does, with yaw as given."""
+    """Return the result of profile_through(), with the given yaw."""
     speed = _fit(grid, s, h, 1.0 / np.square(h), 3, stiffness)
     _, values, dh, ddh, dddh = _on_grid(speed, float(grid[-1] - grid[0]))
     return SpeedProfile(grid, values, dh, ddh, dddh, yaw.yaw, yaw.dyaw, yaw.ddyaw)
@@ -145,5 +145,5 @@ def _fit(grid: NDArray, s: NDArray, values: NDArray, weights: NDArray, degree: i
 
 
 def _coefficient(grid: NDArray, s: NDArray, count: int) -> NDArray:
-    """Return which coefficient each s, ascending, touches most, as a fraction of an index."""
+    """Return the fractional index of the coefficient with most influence at each s, ascending."""
     return (s - grid[0]) / (grid[-1] - grid[0]) * (count - 1)

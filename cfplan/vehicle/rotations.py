@@ -1,11 +1,11 @@
 """Rotations: quaternions x, y, z, w from body to world, their matrices, yaw and tilt, and the Hopf fibration.
 
-One function body serves numpy and numba alike, as both index a quaternion by component: a tuple, an array (4,), or for
-N attitudes at once an array (4, N), which is the transpose of the (N, 4) that trajectories and packets hold.
+One function body serves numpy and numba, as both index a quaternion by component: a tuple, an array (4,), or for N
+attitudes an array (4, N), the transpose of the (N, 4) of trajectories and packets.
 
-The Hopf fibration (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)", 2017) makes an
-attitude of a thrust axis and a yaw: a turn by yaw about the vertical, then the least turn from there to the axis. Euler
-yaw (ZYX), which `yaw_of` gives, differs from it by a little that vanishes with tilt.
+The Hopf fibration (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)", 2017) maps a
+thrust axis and a yaw to an attitude: a turn by yaw about the vertical, then the smallest turn to the axis. Euler yaw
+(ZYX), the result of `yaw_of`, differs from it slightly, and not at all without tilt.
 """
 
 import math
@@ -150,7 +150,7 @@ def write_quaternion(out: NDArray, matrix: NDArray) -> None:
 def quaternion_of(matrix: Matrix) -> tuple[float, float, float, float]:
     """Return the quaternion of a rotation matrix, by way of its largest component (Shepperd 1978).
 
-    There are no branches, so that a compiler can take several at once.
+    There are no branches, so that a compiler can vectorise it.
     """
     (a, b, c), (d, e, f), (g, h, i) = matrix
     trace = a + e + i
@@ -253,5 +253,5 @@ def _write_rotation(out: NDArray, x: float, y: float, z: float) -> None:
 
 
 def norms(vectors: NDArray) -> NDArray:
-    """Return (...) the lengths of vectors (..., K), several times as fast as numpy's norm where K is small."""
+    """Return (...) the lengths of vectors (..., K), several times faster than numpy's norm for small K."""
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))

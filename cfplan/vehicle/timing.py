@@ -16,14 +16,14 @@ from cfplan.machine_code import njit
 from cfplan.vehicle.profile import SpeedProfile, h_within, yaw_within
 
 TOLERANCE = 1e-12  # s, of each piece
-LONGEST = 3600.0  # s, beyond which a profile is a mistake
+LONGEST = 3600.0  # s; a longer profile is an error
 _REMEDY = "plan the path anew; for a profile from elsewhere, h must be positive and smooth"
 _SPLITS = 40  # halvings of an interval before its speed counts as zero
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _NODES, _WEIGHTS = (_NODES + 1.0) / 2.0, _WEIGHTS / 2.0
-_PROBES = (0.2, 0.5, 0.8)  # where in a piece the inverse is tried
+_PROBES = (0.2, 0.5, 0.8)  # places in a piece where the inverse is checked
 _CONTINUOUS = (1, 2, 3, 5, 6)  # columns of a profile's table that must not jump: h, h', h'', yaw, yaw'
-_JUMP = 1e-6  # of one and the most that there is, allowed for rounding
+_JUMP = 1e-6  # relative tolerance of jumps, for rounding
 # Coefficients 4 to 7 of a polynomial on [0, 1] from what is left of it and three derivatives at 1.
 _FAR_END = np.linalg.inv(np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float))
 
@@ -78,14 +78,14 @@ def _edges(left: NDArray, duration: NDArray, end: float) -> tuple[NDArray, NDArr
 def duration_of(profile: SpeedProfile) -> float:
     """Return the time, s, that a profile takes, by one quadrature an interval.
 
-    It is within 1e-6 of the duration where h changes less than tenfold in an interval. Raises NotCertifiedError as
-    measure() does, but for speeds that fall to almost zero.
+    It is within 1e-6 of the duration if h changes less than tenfold per interval. Raises NotCertifiedError like
+    measure(), except for speeds that fall to almost zero.
     """
     return float(_duration(check(profile)))
 
 
 def check(profile: SpeedProfile) -> NDArray:
-    """Return the profile's table. Raises NotCertifiedError unless it is finite, smooth as promised, and h positive."""
+    """Return the profile's table. Raises NotCertifiedError unless it is finite and smooth, and h is positive."""
     intervals = len(profile.s) - 1
     for name in SpeedProfile.__slots__:
         values = getattr(profile, name)
@@ -130,8 +130,8 @@ def _node(nodes: NDArray, bad: NDArray) -> str:
 
 @njit(error_model="numpy")
 def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
-    """Return whether nothing is wrong; the least h in each interval, (N,); jumps at its end, (N, 5), and the largest
-    that are allowed, (5,), of h, h', h'', yaw and yaw'."""
+    """Return whether the profile is valid; the least h in each interval, (N,); jumps at its end, (N, 5), and their
+    tolerances, (5,), of h, h', h'', yaw and yaw'."""
     count = len(nodes) - 1
     least, jumps, allowed = np.empty(count), np.empty((count, 5)), np.zeros(5)
     for k in range(count + 1):
@@ -165,12 +165,12 @@ def _inspect(nodes: NDArray) -> tuple[bool, NDArray, NDArray, NDArray]:
 
 @njit(error_model="numpy")
 def _split(nodes: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray, float]:
-    """Return start, duration, interval and inverse of each piece; and where pieces never get short enough, else NaN."""
+    """Return start, duration, interval and inverse of each piece; and the s where splitting failed, else NaN."""
     room = 2 * len(nodes) + 100
     starts, durations, polynomials = np.empty(room), np.empty(room), np.empty((room, 8))
     parts = np.empty(len(_NODES))
     intervals = np.empty(room, dtype=np.int64)
-    ends, depths = np.empty(_SPLITS + 1), np.empty(_SPLITS + 1, dtype=np.int64)  # right ends of what is still to do
+    ends, depths = np.empty(_SPLITS + 1), np.empty(_SPLITS + 1, dtype=np.int64)  # right ends of the pending parts
     count = 0
     for k in range(len(nodes) - 1):
         node, left, waiting = nodes[k], nodes[k, 0], 1
@@ -252,7 +252,7 @@ def _h(node: NDArray, s: float) -> float:
 def _quadrature(parts: NDArray, node: NDArray, left: float, right: float) -> float:
     """Return the time, s, from `left` to `right`, both in the interval; `parts`, (8,), are to be overwritten.
 
-    The compiler finds several of them at once.
+    The compiler vectorises it.
     """
     width = right - left
     for k in range(len(_NODES)):

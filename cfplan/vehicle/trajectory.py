@@ -36,7 +36,7 @@ class FullState:
     motor_thrust: NDArray  # (N, 4) N, motors 1 to 4
 
     def rows(self, which: int | slice) -> "FullState":
-        """Return one of the states, or some."""
+        """Return one or several of the states."""
         return FullState(*(getattr(self, name)[which] for name in FullState.__slots__))
 
 
@@ -44,7 +44,7 @@ class FullState:
 class Trajectory:
     """The flight of one profile. Before its start and after its end it hovers level at that end of the path.
 
-    Raises NotCertifiedError where h is not finite or not positive everywhere, also between the grid points.
+    Raises NotCertifiedError unless h is finite and positive everywhere, also between the grid points.
     """
 
     path: Path
@@ -68,11 +68,11 @@ class Trajectory:
         return float(self.timing.time[-1])
 
     def time_at(self, s: ArrayLike) -> NDArray:
-        """Return the time, s, at which the vehicle is at s, (N,); within 1e-9 s. s is held within the path."""
+        """Return the time, s, at which the vehicle is at s, (N,); within 1e-9 s. s is clipped to the path."""
         return self.timing.time_at(s)
 
     def s_at(self, time: ArrayLike) -> NDArray:
-        """Return where on the path the vehicle is at each time, (N,); within 1e-9. Time is held within the flight."""
+        """Return s at each time, (N,); within 1e-9. Time is clipped to the flight."""
         return self.timing.s_at(time)
 
     def at(self, time: ArrayLike) -> FullState:
@@ -99,5 +99,5 @@ class Trajectory:
 
 
 def state_of(time: NDArray, s: NDArray, curve: NDArray, rows: NDArray) -> FullState:
-    """Return full states, by name, of what states_at() gives at s, (N,), on a curve, (5, 3, N)."""
+    """Return full states, by name, from the result of states_at() at s, (N,), on a curve, (5, 3, N)."""
     return FullState(time=time, s=s, position=curve[0].T, **{name: rows[where].T for name, where in STATES.items()})

@@ -1,7 +1,7 @@
-"""Sine and cosine without branches, so that a compiler can work on several points at once.
+"""Sine and cosine without branches, so that a compiler can vectorise them.
 
 The polynomials are those of fdlibm (Sun Microsystems, 1993), good to the last bit or two of a double. They hold for
-angles up to a million radians; beyond, and for what is not finite, the result is of no use (NaN stays NaN).
+angles up to a million radians; beyond that, and for infinity, the result is meaningless (NaN stays NaN).
 """
 
 import math
@@ -11,7 +11,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 _PER_QUARTER = 2.0 / math.pi
-# π/2 in parts, the first two with zeros at their ends, so that a small multiple of them is exact.
+# π/2 in parts, the first two with trailing zeros, so that small multiples of them are exact.
 _QUARTER = (1.57079632673412561417, 6.07710050630396597660e-11, 2.02226624879595063154e-21)
 _SINE = (
     -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04, 2.75573137070700676789e-06,

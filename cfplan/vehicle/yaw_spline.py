@@ -5,8 +5,8 @@ Its quadratic B-spline has N+2 coefficients, c₋₁ to c_N, on a grid of N inte
     ψ = (c₀ + c₁)/2,   ψ'Δs = c₁ - c₀,   ψ''Δs² = c₂ - 2c₁ + c₀       where the interval of c₀, c₁, c₂ begins
 
 Where yaw is given before the speed, the spline is fitted to the wanted angle by least squares with a penalty on its
-second differences: where that angle is undefined (flight straight up, a rest) or turns at once, the spline goes
-smoothly across. This is the yaw of the Hopf fibration; heading differs from it by a little that vanishes with tilt.
+second differences: where that angle is undefined (vertical flight, a rest) or jumps, the spline stays
+smooth. This is the yaw of the Hopf fibration; heading differs from it slightly, and not at all without tilt.
 """
 
 from dataclasses import dataclass
@@ -21,12 +21,15 @@ from cfplan.geometry.yaw import YawMode
 from cfplan.machine_code import njit
 from cfplan.vehicle.profile import BoundaryState, SpeedProfile
 
-_SAME_YAW = 1e-6  # rad, and rad by nominal time, that yaw is off or turns at most where it stays as it is
-SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a sudden turn is spread
-SETTLING_LENGTH, TURN = 1.0, 0.3  # s of nominal time, at least, and rad a second of it, to turn from a boundary state
-SAMPLES = 16  # an interval, where the direction of flight is followed
-LEVEL = 0.1  # horizontal share of the direction of flight below which it says nothing about yaw
-_LEAST_WEIGHT = 1e-9  # of each coefficient's own target
+_SAME_YAW = 1e-6  # rad, and rad per nominal second, within which a yaw counts as given
+SMOOTHING_LENGTH = 0.15  # s of nominal time, over which a jump is spread
+SETTLING_LENGTH, TURN = (
+    1.0,
+    0.3,
+)  # s of nominal time, at least, and rad per nominal second, to turn from a boundary state
+SAMPLES = 16  # per interval, for the direction of flight
+LEVEL = 0.1  # least horizontal component of the direction of flight that defines yaw
+_LEAST_WEIGHT = 1e-9  # of each coefficient's target
 _REST = 1e-9  # |γ'| below which a path rests
 KERNEL_WIDTH = 3.0  # nodes, standard deviation of the Gaussian that smooths given angles
 KERNEL_REACH = 12  # nodes on each side, where that Gaussian ends
@@ -56,7 +59,7 @@ class YawSpline:
 
     @classmethod
     def fixed(cls, path: Path, nodes: int, angle: float, start: BoundaryState | None = None) -> "YawSpline":
-        """Return one angle all along, which begins with the yaw of a boundary state where given."""
+        """Return one angle along the whole path, from the yaw of a boundary state if given."""
         still = start is not None and abs(start.yaw - angle) < _SAME_YAW and abs(start.dyaw) < _SAME_YAW
         if start is None or still:
             return cls(np.full(nodes + 1, start.yaw if start else angle), np.zeros(nodes + 1), np.zeros(nodes))
@@ -87,7 +90,7 @@ class YawSpline:
     def smoothed(cls, yaw: NDArray, step: float, start: BoundaryState | None) -> "YawSpline":
         """Return a smooth spline through angles at the nodes, (N+1,), smoothed by a Gaussian.
 
-        The first and last angle count as if they went on. Yaw begins in a boundary state where given.
+        The first and last angle are extended beyond the ends. Yaw begins in a boundary state if given.
         """
         coefficients = _smooth(np.asarray(yaw, dtype=float))
         if start is not None:
@@ -155,7 +158,7 @@ def _fit(path: Path, nodes: int, target: NDArray, weight: NDArray, start: Bounda
     if start is not None:
         target = target + _turn_from(start, target, step / 2, path.end)
         known[:2], own[:2] = end_coefficients(start.yaw, start.dyaw * step), 0
-    elif np.linalg.norm(path(0.0, 1)) < _REST:  # nothing turns there: the first two have one value
+    elif np.linalg.norm(path(0.0, 1)) < _REST:  # nothing turns there: the first two are equal
         own[1] = 0
     if np.linalg.norm(path(path.end, 1)) < _REST:
         own[-1] = 0
@@ -172,7 +175,7 @@ def _fitted(target: NDArray, weight: NDArray, smoothing: float, slots: NDArray, 
     nodes = (len(target) - 1) // 2
     matrix, right = np.zeros((slots[-1] + 1, 3)), np.zeros(slots[-1] + 1)
     for k in range(nodes + 2):
-        if np.isnan(known[k]):  # so that some value is the best where nothing has a weight
+        if np.isnan(known[k]):  # for a unique solution where nothing has a weight
             matrix[slots[k], 0] += _LEAST_WEIGHT
             right[slots[k]] += _LEAST_WEIGHT * target[min(2 * k, 2 * nodes)]
     for k in range(nodes):

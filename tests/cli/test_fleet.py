@@ -2,14 +2,29 @@
 
 import pytest
 
+LINES = "vehicles:\n  a: {path: line.yaml}\n  b: {path: line.yaml, place: {yaw_deg: 90}}\n"
+
 
 @pytest.fixture
 def fleet_file(tmp_path):
-    """Two short lines that cross."""
+    """Two lines that cross."""
+    (tmp_path / "line.yaml").write_text("waypoints: [[-1, 0, 1], [1, 0, 1]]\nshape: min-snap\n")
+    file = tmp_path / "fleet.yaml"
+    file.write_text(LINES)
+    return file
+
+
+@pytest.fixture
+def narrow_fleet(tmp_path):
+    """Write a fleet of two lines beside each other, nearer than the drift of a lost vehicle."""
     (tmp_path / "line.yaml").write_text("waypoints: [[-0.6, 0, 1], [0.6, 0, 1]]\nshape: min-snap\n")
     file = tmp_path / "fleet.yaml"
-    file.write_text("vehicles:\n  a: {path: line.yaml}\n  b: {path: line.yaml, place: {yaw_deg: 90}}\n")
-    return file
+
+    def write(*lines: str):
+        file.write_text("\n".join((*lines, LINES.replace("yaw_deg: 90", "y: 0.35"))))
+        return file
+
+    return write
 
 
 def test_a_fleet_is_planned_and_its_pairs_are_certified(cfplan, fleet_file, safety_file):
@@ -20,6 +35,38 @@ def test_a_fleet_is_planned_and_its_pairs_are_certified(cfplan, fleet_file, safe
     assert document["duration"] >= document["slowest_alone"]
     assert any(each["starts"] > 0.0 or each["slower_for"] for each in document["vehicles"])
     assert all(each["certificate"]["passed"] for each in document["vehicles"])
+
+
+def test_each_lost_vehicle_is_kept_clear_of_by_the_others(cfplan, fleet_file, safety_file):
+    document = cfplan("plan", fleet_file, "--safety", safety_file(), "--json").json
+    assert {tuple(each["vehicles"]) for each in document["lost"]} == {("a",), ("b",)}
+    for each in document["lost"]:
+        assert each["distance"] >= document["apart"] - 0.1
+        assert each["reaction"] == "the others brake"
+        assert 0.0 <= each["time"] <= document["duration"]
+    printed = cfplan("plan", fleet_file, "--safety", safety_file()).out
+    assert "Lost vehicles: passed" in printed
+
+
+def test_a_lost_vehicle_that_may_meet_another_is_refused_unless_the_file_only_warns(cfplan, narrow_fleet, safety_file):
+    refused = cfplan("plan", narrow_fleet(), "--safety", safety_file())
+    assert refused.code == 3
+    for each in ("m from a lost vehicle", " lost at (", "the others brake", "lost: warn"):
+        assert each in " ".join(refused.err.split())
+    warned = cfplan("plan", narrow_fleet("lost: warn"), "--safety", safety_file())
+    assert warned.code == 0
+    assert "Lost vehicles: not passed" in warned.out
+
+
+def test_the_vehicles_of_one_dongle_are_lost_together(cfplan, narrow_fleet, safety_file):
+    file = narrow_fleet("lost: warn")
+    with_uris = file.read_text().replace("line.yaml}", "line.yaml, uri: 'radio://0/80/2M/E7E7E7E701'}")
+    file.write_text(with_uris.replace("0.35}", "0.35}, uri: 'radio://0/80/2M/E7E7E7E702'"))
+    lost = cfplan("plan", file, "--safety", safety_file(), "--json").json["lost"]
+    together = [each for each in lost if each["vehicles"] == ["a", "b"]]
+    assert len(together) == 1
+    assert together[0]["reaction"] == "all are lost"
+    assert together[0]["distance"] < 0.2
 
 
 @pytest.mark.parametrize(

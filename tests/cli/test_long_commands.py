@@ -36,6 +36,7 @@ SMALL_STUDIES = {
     "dry-runs": LINE,
     "exports": LINE,
     "faults": f"{LINE} --only radio",
+    "fleets": "--fleets 1 --size 2 --moments 2",
     "flights": f"{LINE} --repeats 1",
     "giving-way": f"{LINE} --random 1",
     "hardware": QUICK,

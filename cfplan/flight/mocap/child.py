@@ -1,7 +1,7 @@
 """The process in which a motion capture driver runs; its messages go through a pipe.
 
-A driver may hang without ever giving the interpreter back, so no thread and no signal handler of Python's can end it:
-the kernel's own alarm does, which is set anew before every step.
+A driver may hang without ever releasing the interpreter, so neither a thread nor a Python signal handler can end it.
+The kernel's alarm does, which is set again before every step.
 """
 
 import marshal
@@ -20,7 +20,7 @@ from cfplan.flight.mocap.sdk import SdkDriver
 from cfplan.flight.mocap.uri import MocapUri, parse_uri
 from cfplan.flight.real_time import lock_memory
 
-HEAD = struct.Struct("<I?")  # bytes of the message that follows, and whether it is a frame
+HEAD = struct.Struct("<I?")  # length of the message in bytes, and whether it is a frame
 CONNECT_ALARM = 2.5  # s to resolve the name, connect, and ask for frames
 FRAME_ALARM = 1.5  # s between frames
 _TRY_AGAIN = 0.1  # s
@@ -30,7 +30,7 @@ Message = Frame | Scene | DriverStage | CfplanError
 
 
 def encoded(message: Message) -> bytes:
-    """Return a message as bytes. Frames are many, and are read where time is short: they go as plain tuples."""
+    """Return a message as bytes. Frames are frequent and time-critical, so they are sent as plain tuples."""
     if isinstance(message, Frame):
         bodies = tuple((body.name, body.position, body.quaternion, body.quality) for body in message.bodies)
         plain = (message.received, bodies, message.hidden, message.number, message.rate, message.latency)
@@ -72,13 +72,13 @@ class Outlet:
         self._descriptor, self._subject = descriptor, subject
 
     def send(self, message: Message) -> None:
-        """Send a message. Raises BrokenPipeError if the pipe has no reader any more."""
+        """Send a message. Raises BrokenPipeError if the pipe has lost its reader."""
         data = encoded(message)
         while data:
             data = data[os.write(self._descriptor, data) :]
 
     def send_frame(self, frame: Frame) -> None:
-        """Send a frame, with only the body that was asked for."""
+        """Send a frame, reduced to the requested body if there is one."""
         if self._subject:
             bodies = tuple(body for body in frame.bodies if body.name == self._subject)
             hidden = () if bodies else (self._subject,)
@@ -87,9 +87,9 @@ class Outlet:
 
 
 def run(uri: MocapUri, outlet: Outlet, *, again: bool) -> None:
-    """Connect and send frames, for ever; connect again if a stream is lost.
+    """Connect and send frames forever; reconnect if the stream is lost.
 
-    `again` says that an earlier process has had a stream. Without one, a failure to connect ends the run.
+    `again`: an earlier process had a stream. Otherwise a failure to connect ends the run.
     """
     while True:
         driver = driver_of(uri)
@@ -140,7 +140,7 @@ def _alarm(seconds: float) -> None:
 
 
 def _take_priority() -> None:
-    """Run ahead of other processes if permitted; not for the vendors' clients, which may spin for ever."""
+    """Take real-time priority if permitted; not for the vendors' clients, which may spin forever."""
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
 
@@ -159,7 +159,7 @@ def main() -> None:
         run(uri, outlet, again=again == "again")
     except BrokenPipeError:
         return
-    except Exception as error:  # the parent must learn of anything that a driver raises
+    except Exception as error:  # the parent must learn of every error
         outlet.send(
             InputError(
                 f"fault in the driver: {error!r}",

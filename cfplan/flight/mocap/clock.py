@@ -1,32 +1,31 @@
-"""Date frames back: when a frame was taken, from when it arrived.
+"""Capture times: when a frame was taken, from its number and its arrival.
 
-A frame comes late by what the network and the computers add at that moment. Frame numbers count at the cameras' steady
-rate, so the earliest arrival tells when each number should have come, and what is later than that was delayed on its
-way: its pose is older than it looks, however long the delay lasts. The rate that a system announces is believed once
-its numbers were seen to count at it.
+Network and computers delay frames by varying times. Frame numbers advance at the cameras' steady rate, so the earliest
+arrival shows when each number is due. A frame that arrives later was delayed on its way, and its pose is older by as
+much, however long the delay lasts. The announced rate is used once the frame numbers have been seen to advance at it.
 """
 
 import math
 
-_RATE_CHECK_PERIOD = 1.0  # s; over two of these the frame numbers must count at the announced rate
-_DRIFT = 5e-4  # relative difference of the two clocks; the earliest arrival is forgotten at this rate
-_RATE_TOLERANCE = _DRIFT  # relative error of that rate, from the earliest arrivals of both proofs
+_RATE_CHECK_PERIOD = 1.0  # s; the announced rate is checked over two such periods
+_DRIFT = 5e-4  # relative difference of the two clocks, at which the earliest arrival is forgotten
+_RATE_TOLERANCE = _DRIFT  # of the announced rate, from the earliest arrivals of both periods
 
 
 class FrameClock:
-    """Dates frames back. Without frame numbers or a rate that holds, a frame counts as just taken.
+    """Computes capture times. Without frame numbers or a confirmed rate, a frame counts as just taken.
 
-    `latency`, s, is the time from the exposure to this computer when nothing delays a frame.
+    `latency`, s, is the time from exposure to arrival of a frame that is not delayed.
     """
 
     def __init__(self, latency: float):
         self._latency = latency
         self._number: int | None = None
         self._rate = math.nan
-        # s, the earliest arrival in the first and in the second time of proof; None once the rate is proven
+        # s, earliest arrival of frame 0 in the first and in the second check period; None once the rate is confirmed
         self._earliest_of_halves: list[float] | None = None
         self._check_begin = math.nan
-        # s, when number 0 came, according to the earliest arrivals; the last arrival
+        # s: arrival of frame 0 according to the earliest arrivals; the last arrival
         self._earliest = self._heard = math.inf
 
     @property

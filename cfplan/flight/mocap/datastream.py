@@ -3,8 +3,8 @@
     packet = u32 OBJECTS, u32 length, block*        block = u32 type, u32 length, payload
     string = u32 n, bytes        vector, set, map = u32 n, items
 
-A server need not repeat what has not changed since its last packet: the contents block then lists the type as
-unchanged, and the client keeps what it had.
+A server need not repeat blocks that have not changed since its last packet: the contents block then lists their types
+as unchanged, and the client keeps the old values.
 """
 
 import math
@@ -20,7 +20,7 @@ OBJECTS = 0x1A2B0001
 PACKET_HEAD = struct.Struct("<II")
 LARGEST_PACKET = 16 << 20  # bytes; a larger size means that this is not a packet
 _SEGMENT = struct.Struct("<I12d")
-_ROTATION_ERROR = 1e-3  # by which a matrix's product with its transpose may differ from the unit matrix
+_ROTATION_ERROR = 1e-3  # on a matrix's product with its transpose, which must be the identity
 
 
 class Block(IntEnum):
@@ -47,11 +47,11 @@ WANTED = (
 
 
 class MalformedError(ValueError):
-    """These bytes are not a DataStream."""
+    """The bytes are not a DataStream."""
 
 
 class Fields:
-    """Reads the fields of a block one after the other."""
+    """Reads the fields of a block in order."""
 
     def __init__(self, data: memoryview):
         self._data, self._at = data, 0
@@ -79,7 +79,7 @@ class Fields:
         return bytes(self._data[self._at - size : self._at]).decode("utf-8", "replace")
 
 
-_LONGEST_LATENCY = 60.0  # s; a server that says more does not know it
+_LONGEST_LATENCY = 60.0  # s; a larger value means that the server does not know it
 _U32, _I8, _F64 = struct.Struct("<I"), struct.Struct("<b"), struct.Struct("<d")
 _IDS_AND_BOUNDS = struct.Struct("<II6f")
 _QUALITY = struct.Struct("<Id")
@@ -127,7 +127,7 @@ class _Known:
 
 @dataclass(slots=True)
 class Decoder:
-    """Decodes frames; keeps what a server does not repeat."""
+    """Decodes frames; keeps the values that a server does not repeat."""
 
     _subjects: dict[int, _Known] = field(default_factory=dict)
     _seen: dict[int, dict[int, tuple[float, ...]]] = field(default_factory=dict)
@@ -161,7 +161,7 @@ class Decoder:
                 self._latency = latency if abs(latency) < _LONGEST_LATENCY else math.nan
             elif kind == Block.FRAME_RATE_INFO:
                 rates = [(fields.string(), fields.take(_F64)[0]) for _ in range(fields.count(12))]
-                # The cameras' rate where there are several: the system's own name for it is "Hardware".
+                # The cameras' rate if there are several; the system names it "Hardware".
                 self._rate = next((rate for name, rate in rates if rate > 0), math.nan)
             elif kind == Block.OBJECT_QUALITY:
                 number, quality = fields.take(_QUALITY)
@@ -207,7 +207,7 @@ def _subject(fields: Fields) -> tuple[int, _Known]:
         segments[number] = fields.string()
         if root is None and parent == 0:
             root = number
-    # As the SDK's users do: the segment that bears the body's name; the root where there is none.
+    # As users of the SDK do: the segment with the body's name, else the root.
     named = next((number for number, segment in segments.items() if segment == name), None)
     tracked = named if named is not None else root if root is not None else next(iter(segments), 0)
     return subject, _Known(name, segments, tracked)
@@ -222,13 +222,13 @@ def _body(name: str, pose: tuple[float, ...], y_up: bool, quality: float) -> Tra
     """Return a body in metres, with a quaternion from the matrix, and z up."""
     x, y, z = (value / 1000 for value in pose[:3])
     qx, qy, qz, qw = _quaternion(pose[3:])
-    if y_up:  # x stays, y up becomes z up: a turn by 90° about x, of the world and of the body's own axes
+    if y_up:  # y up to z up: 90° about x, of the world and of the body's axes
         return TrackedBody(name, (x, -z, y), (qx, -qz, qy, qw), quality)
     return TrackedBody(name, (x, y, z), (qx, qy, qz, qw), quality)
 
 
 def _quaternion(matrix: tuple[float, ...]) -> Quaternion:
-    """Return x y z w of a row-major rotation matrix; not a number if it is not a rotation."""
+    """Return x y z w of a row-major rotation matrix; NaN if it is not a rotation."""
     nowhere = (math.nan, math.nan, math.nan, math.nan)
     a, b, c, d, e, f, g, h, i = matrix
     error = max(
@@ -238,7 +238,7 @@ def _quaternion(matrix: tuple[float, ...]) -> Quaternion:
     )  # fmt: skip
     if not error < _ROTATION_ERROR:
         return nowhere
-    # The largest of four equivalent forms, so that nothing small is divided by.
+    # Of four equivalent forms, the one with the largest divisor.
     largest = max(a + e + i, a, e, i)
     if largest == a + e + i:
         q = (h - f, c - g, d - b, 1 + a + e + i)

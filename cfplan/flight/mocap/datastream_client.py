@@ -1,7 +1,7 @@
 """A client of Vicon's DataStream in plain Python.
 
-It gives what the `motioncapture` package hides: frame number, rate, the server's latency, quality, occlusion by name,
-and an error at once where the server goes away.
+It reports what the `motioncapture` package hides: frame number, rate, the server's latency, quality, occlusion by name,
+and an error as soon as the server goes away.
 """
 
 import socket

@@ -1,12 +1,13 @@
 """Dead reckoning: how the vehicle has moved and turned since a pose, by its own sensors.
 
-A pose that is older than a straight line can bridge says where the vehicle was, not where it is. Sent as it is, it
-pulls the vehicle's filter back by the way flown since, and its velocity most of all: at 1.8 m/s, eight poses of 0.12 s
-ago made the filter believe 0.7 m/s less. Without further poses a vehicle that believes that leaves the room.
+A pose that is too old to extrapolate by a straight line tells where the vehicle was, not where it is. Sent unchanged,
+it pulls the filter's position back by the distance flown since, and its velocity too: at 1.8 m/s, eight poses that were
+0.12 s old lowered the estimated velocity by 0.7 m/s. Without further poses, a vehicle with such an estimate leaves the
+room.
 
-What has happened since the pose is in the vehicle's log: acceleration and body rates. They are integrated from the
-poses on. Position and velocity of the vehicle's estimate are not used, so nothing that the filter has wrong comes back
-to it as a measurement.
+The vehicle's log has the motion since the pose, as acceleration and body rates, which are integrated from the last
+poses. Position and velocity of the vehicle's estimate are not used, so errors of the filter are not fed back to it as
+measurements.
 """
 
 import math
@@ -18,14 +19,14 @@ from numpy.typing import NDArray
 from cfplan.flight.telemetry import Estimate, Quaternion, Triple, VehicleStatus
 from cfplan.vehicle.rotations import product
 
-_HISTORY = 1.5  # s of the log that are kept, more than a pose that is sent may be old (`pose.age_brake` is at most 1 s)
-_LONGEST_GAP = 0.1  # s between two messages of the log, beyond which the motion between them is unknown
+_HISTORY = 1.5  # s of log to keep; poses that are sent are younger (`pose.age_brake` is at most 1 s)
+_LONGEST_GAP = 0.1  # s between log messages; the motion in a longer gap counts as unknown
 
 _Samples = deque[tuple[float, Triple]]
 
 
 class SensedMotion:
-    """What accelerometer and gyroscope have measured in the last second, by the vehicle's log."""
+    """The last second of accelerometer and gyroscope measurements from the vehicle's log."""
 
     def __init__(self) -> None:
         self._accelerations: _Samples = deque()  # s, m/s² in world axes, without gravity
@@ -39,9 +40,9 @@ class SensedMotion:
             _append(self._rates, status.time, status.body_rate)
 
     def displacement(self, velocity: Triple, at: float, since: float, now: float) -> Triple | None:
-        """Return the way, m, from `since` to `now`, s, of a vehicle that had `velocity`, m/s, `at` a time before, s.
+        """Return the displacement, m, from `since` to `now`, s, of a vehicle with `velocity`, m/s, at time `at`.
 
-        None where the log does not say what happened meanwhile.
+        None if the log has a gap in between.
         """
         known = _between(self._accelerations, at, now, since)
         if known is None:
@@ -55,7 +56,7 @@ class SensedMotion:
         return x, y, z
 
     def turn(self, quaternion: Quaternion, since: float, now: float) -> Quaternion | None:
-        """Return the attitude at `now` of a vehicle that had another `since` then, s; None where the log is missing."""
+        """Return the attitude at `now`, s, of a vehicle with `quaternion` at `since`; None if the log has a gap."""
         known = _between(self._rates, since, now)
         if known is None:
             return None
@@ -76,7 +77,7 @@ def _append(samples: _Samples, time: float, value: Triple) -> None:
 
 
 def _between(samples: _Samples, begin: float, end: float, *marks: float) -> tuple[NDArray, NDArray] | None:
-    """Return times (N,), s, from `begin` to `end`, and values (N, 3) then; None where too much is missing."""
+    """Return times (N,), s, from `begin` to `end`, and values (N, 3) at these; None if there is a gap."""
     times = np.array([time for time, _ in samples])
     if len(times) == 0 or times[0] > begin:
         return None

@@ -17,7 +17,7 @@ from cfplan.flight.real_time import use_ordinary_scheduling
 
 _CHUNK = 1 << 16  # bytes
 _CHECK_PERIOD = 0.05  # s between checks of the child
-_LONGEST_SILENCE = CONNECT_ALARM + 1.0  # s, after which a child is killed that the kernel's alarm did not end
+_LONGEST_SILENCE = CONNECT_ALARM + 1.0  # s until the child is killed, if the kernel's alarm failed
 RESTART_BACKOFF = 0.2  # s before a new child
 
 
@@ -37,7 +37,7 @@ class Feed:
         self.restarts = 0
 
     def start(self) -> None:
-        """Start the child; `failure` tells if it fails."""
+        """Start the child; `failure` returns its error."""
         self._spawn("first")
 
     def keep(self) -> None:
@@ -145,7 +145,7 @@ class Feed:
             self.restarts += 1
             try:
                 self._spawn("again")
-            except OSError:  # no memory, no processes left: later, perhaps
+            except OSError:  # no memory or processes left: retry later
                 continue
 
     def _is_silent(self) -> bool:

@@ -14,7 +14,7 @@ class TrackedBody:
     name: str
     position: Triple  # m
     quaternion: Quaternion  # body→world, x y z w; not a number if the system sent no rotation
-    quality: float = math.nan  # 0 to 1, if the system tells
+    quality: float = math.nan  # 0 to 1, if the system reports it
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,10 +23,10 @@ class Frame:
 
     received: float  # s on the clock of time.monotonic(), when it reached this computer
     bodies: tuple[TrackedBody, ...]  # bodies that were seen
-    hidden: tuple[str, ...] = ()  # bodies that the system knows and did not see
+    hidden: tuple[str, ...] = ()  # known bodies that were not seen
     number: int | None = None  # in the system's own count, if it has one
-    rate: float = math.nan  # Hz, if the system tells
-    latency: float = math.nan  # s from the exposure to the system's sending, if it tells
+    rate: float = math.nan  # Hz, if the system reports it
+    latency: float = math.nan  # s from exposure to sending, if the system reports it
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Driver(Protocol):
         """Wait for the next frame and return it. Raises LinkError if the stream has ended."""
 
     def scene(self) -> Scene | None:
-        """Return the bodies that the system knows, as of the last frame; None if it does not tell."""
+        """Return the bodies that the system knows, as of the last frame; None if it does not report them."""
 
     def close(self) -> None:
         """Disconnect; may be called twice, and before connecting."""

@@ -18,15 +18,15 @@ from cfplan.flight.telemetry import Quaternion, Triple
 _NORM_TOLERANCE = 0.01  # on the norm of a quaternion, which must be 1
 _MAX_TURN_PER_FRAME = 0.5  # rad from one pose to the next, at any frame rate
 
-# Against the track. A marker pattern that is seen the wrong way round turns by 90° or 180°.
+# Against the track. A flipped marker pattern turns by 90° or 180°.
 _TRACK_SPEED, _TRACK_TURN_RATE, _MAX_TRACK_TURN = 4.0, 12.0, 1.3  # m/s, rad/s; rad after any gap
 _TRACK_ACCELERATION = 20.0  # m/s², largest acceleration since the last good pose; twice what a flight may reach
 _ATTITUDE_TIMEOUT = 0.2  # s; after a longer gap a pose is compared with the estimated attitude
 _HISTORY = 0.1  # s of good poses, from which the velocity is computed
 _MAX_EXTRAPOLATION = 0.3  # s, largest extrapolation with that velocity
-_SWITCH_AFTER = 30.0  # s that another track must last; no landing takes that long
+_SWITCH_AFTER = 30.0  # s for which another track must last to be accepted; no landing takes that long
 
-# Against the vehicle: beyond what it can do, and where it cannot be by its own estimate.
+# Against the vehicle: motion beyond its abilities, or a position far from its estimate.
 _VEHICLE_SPEED, _VEHICLE_TURN_RATE = 6.0, 25.0  # m/s, rad/s
 _MIN_GAP = 0.1  # s without a good pose, after which the next one must agree with the vehicle's estimate
 _ESTIMATE_DRIFT = 0.5  # m/s², largest error of that estimate's acceleration meanwhile
@@ -58,13 +58,13 @@ class Verdict(StrEnum):
 class PoseCheck:
     """Judges the poses of one body, in the order of their time.
 
-    `jump` in m, of a pose from where the last ones led.
+    `jump`: largest distance, m, of a good pose from the extrapolated position.
     """
 
     def __init__(self, jump: float):
         self._jump = jump
         self._track: deque[tuple[float, Placed]] = deque()
-        self._confirmed: tuple[float, Placed] | None = None  # the last of the track that the vehicle can have reached
+        self._confirmed: tuple[float, Placed] | None = None  # the last pose that the vehicle can have reached
         self._seen: Placed | None = None
         self._number: int | None = None
         self._other: tuple[float, Placed] | None = None
@@ -76,9 +76,9 @@ class PoseCheck:
     def judge(
         self, time: float, body: Placed | None, number: int | None = None, believed: Triple | None = None
     ) -> Verdict:
-        """Return what this pose is; `body` is None where it was not seen, `number` the frame's where there is one.
+        """Return the verdict on a pose; `body` is None if it was not seen, `number` the frame's if frames are numbered.
 
-        `believed`, m, is where the vehicle itself believes that it was then; None where it does not tell.
+        `believed`, m, is the vehicle's estimate of its position at `time`, s; None if there is none.
         """
         verdict = self._against_frame(time, body, number)
         self._number = number
@@ -100,7 +100,7 @@ class PoseCheck:
         if not (all(map(math.isfinite, (time, *body.position))) and _is_rotation(body.quaternion)):
             return Verdict.BROKEN
         if self._seen is not None and (body.position, body.quaternion) == (self._seen.position, self._seen.quaternion):
-            return Verdict.FROZEN  # to the last bit, as no measurement of a body is
+            return Verdict.FROZEN  # identical to the last bit, which no measurement is
         if not self._track:
             return Verdict.GOOD
         if time <= self._track[-1][0]:
@@ -136,7 +136,7 @@ class PoseCheck:
         return verdict
 
     def _expected(self, time: float) -> Triple:
-        """Return where, m, the last good poses led."""
+        """Return the position, m, extrapolated from the last good poses."""
         (first_time, first), (last_time, last) = self._track[0], self._track[-1]
         span = last_time - first_time
         ahead = min(time - last_time, _MAX_EXTRAPOLATION)

@@ -6,9 +6,9 @@ from typing import Protocol
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Where the vehicle was seen at one moment."""
+    """A measured pose of the vehicle."""
 
-    time: float  # s on the clock of time.monotonic(), when it was there (already less the source's latency)
+    time: float  # s on the clock of time.monotonic(), when it was measured (the source's latency is subtracted)
     received: float  # s, when it reached this process
     position: tuple[float, float, float]  # m
     quaternion: tuple[float, float, float, float]  # body→world, x y z w
@@ -16,12 +16,12 @@ class Pose:
 
 
 class PoseSource(Protocol):
-    """Delivers poses as they are seen, each once; `PoseTracker` judges them. Opened in the process that uses it."""
+    """Delivers each measured pose once; `PoseTracker` judges them. Opened in the process that uses it."""
 
-    fault: str  # why no pose comes; "" while poses come, or if the source does not know
+    fault: str  # why there are no poses; "" while there are, or if the source does not know
 
     def open(self) -> None:
-        """Start. Raises a CfplanError within 5 s if no pose can come."""
+        """Start. Raises a CfplanError within 5 s if there can be no pose."""
 
     def poses(self) -> list[Pose]:
         """Return the poses since the last call, oldest first; never waits."""

@@ -1,8 +1,8 @@
 """A driver that uses the vendors' own clients, by the `motioncapture` package.
 
-They tell neither frame number nor latency, and they hang: Vicon's holds the interpreter while it looks for a server,
-spins when the server goes away, and is silent about a subject whose segment has another name. So this runs only in a
-process that can be killed, and checks beforehand what it can.
+They report neither frame number nor latency, and they hang: Vicon's client holds the interpreter while it looks for a
+server, spins when the server goes away, and hides a subject whose segment has another name. Therefore this driver runs
+only in a process that can be killed, and checks in advance what it can.
 """
 
 import math
@@ -19,7 +19,7 @@ from cfplan.flight.mocap.uri import MocapUri
 if TYPE_CHECKING:
     import motioncapture
 
-_SCENE_TIMEOUT = 0.5  # s to hear of the subjects
+_SCENE_TIMEOUT = 0.5  # s to read the subjects
 _NAMES = {"vicon-sdk": "vicon", "optitrack-sdk": "optitrack_closed_source"}  # the package's names where they differ
 
 
@@ -37,7 +37,7 @@ class SdkDriver:
         try:
             import motioncapture
 
-            import_module("numpy")  # the package does so with its first pose, which would then come late
+            import_module("numpy")  # the package imports it with its first pose, which would then be late
         except ImportError as why:
             raise InputError(
                 "the package motioncapture is not installed",
@@ -80,7 +80,7 @@ class SdkDriver:
         return Frame(received, bodies, tuple(sorted(known - seen.keys())))
 
     def scene(self) -> Scene | None:
-        """Return Vicon's subjects; None for the other systems, which tell only what they have seen so far."""
+        """Return Vicon's subjects; None for other systems, which list only bodies seen so far."""
         return self._scene
 
     def close(self) -> None:
@@ -105,7 +105,7 @@ class SdkDriver:
         }[self._uri.system]
 
     def _read_scene(self) -> Scene | None:
-        """Return the subjects and their segments, which Vicon's own client does not tell."""
+        """Return the subjects and their segments, which Vicon's own client does not list."""
         client = DataStreamClient(self._uri.host, self._uri.port, str(self._uri))
         try:
             client.connect()
@@ -122,7 +122,7 @@ def _body(name: str, body: "motioncapture.RigidBody") -> TrackedBody:
     x, y, z = (float(value) for value in body.position)
     turn = body.rotation
     quaternion = (float(turn.x), float(turn.y), float(turn.z), float(turn.w))
-    norm = math.sqrt(math.fsum(value * value for value in quaternion))  # single precision leaves it a little off 1
+    norm = math.sqrt(math.fsum(value * value for value in quaternion))  # near 1 in single precision
     if abs(norm - 1.0) < 1e-3:
         quaternion = (turn.x / norm, turn.y / norm, turn.z / norm, turn.w / norm)
     return TrackedBody(name, (x, y, z), quaternion)

@@ -16,9 +16,9 @@ from cfplan.safety.limits import PoseLimits
 
 OPEN_TIMEOUT = 3.5  # s to see the first good poses
 _FARTHEST = 30.0  # m from the origin; no lab is larger, but a lab in millimetres is
-_LARGEST_TILT = math.radians(45)  # of a vehicle that stands on the floor
-_READ_PERIOD = 0.005  # s between looks for them
-_MIN_GOOD_POSES = 5  # good poses that prove a body
+_LARGEST_TILT = math.radians(45)  # of a vehicle on the floor
+_READ_PERIOD = 0.005  # s between polls
+_MIN_GOOD_POSES = 5  # for the body to count as tracked
 
 
 def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_TIMEOUT) -> "MocapSource":
@@ -29,8 +29,7 @@ def pose_source(uri: str, limits: PoseLimits, *, open_within: float = OPEN_TIMEO
 class MocapSource:
     """A PoseSource; goes to another process before it is opened.
 
-    Poses are dated back to when they were taken. A stream that is lost comes back by itself; until then there is
-    silence.
+    Poses carry the time at which they were measured. A lost stream is reconnected; meanwhile there are no poses.
     """
 
     def __init__(
@@ -52,7 +51,7 @@ class MocapSource:
         self._frame_clock = FrameClock(self._limits.latency)
         self._scene: Scene | None = None
         self.hidden = 0  # frames without the body
-        self.fault = ""  # why no pose comes; "" while poses come
+        self.fault = ""  # why there are no poses; "" while there are
 
     @property
     def sees_delays(self) -> bool:
@@ -61,7 +60,7 @@ class MocapSource:
 
     @property
     def child_id(self) -> int | None:
-        """Return the process in which the driver runs, None where there is none."""
+        """Return the id of the driver's process; None if there is none."""
         return self._feed.child_id if self._feed is not None else None
 
     def open(self) -> None:
@@ -76,7 +75,7 @@ class MocapSource:
                 self._check_subject()
                 failure = self._feed.failure()
                 if failure is not None:
-                    self._judge_new_poses(check)  # its last words say more
+                    self._judge_new_poses(check)  # its last message says more
                     raise failure
                 if self._clock.now() > deadline:
                     raise self._nothing_came(check)
@@ -93,7 +92,7 @@ class MocapSource:
         found, self._first = self._first, []
         try:
             return found + self._read()
-        except CfplanError as error:  # a child that was started again does not find its server: another will try
+        except CfplanError as error:  # a restarted child does not find its server: the next one will retry
             self.fault = error.what
             return found
 
@@ -134,7 +133,7 @@ class MocapSource:
             if check.judge(pose.time, pose, pose.number) is Verdict.GOOD:
                 _check_looks(pose, str(self._uri))
 
-    # Messages about what is wrong.
+    # Error messages.
 
     def _check_subject(self) -> None:
         """Raise InputError as soon as it is clear that this body will never be seen."""
@@ -191,7 +190,7 @@ def _check_looks(pose: Pose, where: str) -> None:
             hint="let the system send metres",
         )
     x, y = pose.quaternion[:2]
-    upright = 1.0 - 2.0 * (x * x + y * y)  # of the body's z axis, its z
+    upright = 1.0 - 2.0 * (x * x + y * y)  # z component of the body's z axis
     if upright < math.cos(_LARGEST_TILT):
         tilt = math.degrees(math.acos(max(-1.0, upright)))
         raise InputError(

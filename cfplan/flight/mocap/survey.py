@@ -1,4 +1,4 @@
-"""A survey of a motion capture system: what it sends, and whether that is good enough to fly by."""
+"""Survey of a motion capture system: its stream, its bodies, and whether they are good enough to fly with."""
 
 import math
 import statistics
@@ -18,7 +18,7 @@ from cfplan.vehicle.rotations import tilt_of, yaw_of
 
 FIRST_FRAME_TIMEOUT = 3.5  # s
 _JUMP = 0.15  # m
-_DROPOUT = 1.5  # periods between frames; one is missing where it takes longer
+_DROPOUT = 1.5  # periods between frames, beyond which a frame counts as missing
 _READ_PERIOD = 0.005  # s
 _SHOW_PERIOD = 0.25  # s
 
@@ -28,16 +28,16 @@ class BodyReport:
     """One body over the time of the survey."""
 
     name: str
-    segments: tuple[str, ...]  # the root first; empty where the system does not tell
+    segments: tuple[str, ...]  # the root first; empty if the system does not report them
     counts: dict[str, int]  # frames by verdict
     position: Triple | None  # m, the last
     yaw: float  # rad, the last
     tilt: float  # rad, the last
-    quality: float  # the last, not a number where the system does not tell
+    quality: float  # the last; NaN if the system does not report it
 
     @property
     def seen(self) -> float:
-        """Return the share of the frames in which the body was seen."""
+        """Return the fraction of frames in which the body was seen."""
         total = sum(self.counts.values())
         return 1.0 - self.counts.get(Verdict.OCCLUDED, 0) / total if total else 0.0
 
@@ -61,14 +61,14 @@ class Survey:
 
     seconds: float
     frames: int
-    rate: float  # Hz, as the frames came
-    announced_rate: float  # Hz, as the system says; not a number where it does not
+    rate: float  # Hz, measured
+    announced_rate: float  # Hz, as the system reports it, else NaN
     jitter: float  # s, standard deviation of the time between frames
     longest_gap: float  # s between frames
-    dropouts: int  # frames that are missing: by their numbers where there are some, else by the gaps
-    latency: float  # s from exposure to sending, as the system says; not a number where it does not
+    dropouts: int  # missing frames, by their numbers if there are any, else by the gaps
+    latency: float  # s from exposure to sending, as the system reports it, else NaN
     delay: float
-    """s, 99th percentile of the delay over the shortest seen; not a number without frame numbers, or too early."""
+    """s, 99th percentile of the delay above the shortest one; NaN without frame numbers, or too early."""
     bodies: tuple[BodyReport, ...]
 
 
@@ -87,11 +87,11 @@ class Surveyor:
 
     @property
     def frames(self) -> int:
-        """Return how many frames came."""
+        """Return the number of frames."""
         return len(self._received)
 
     def add(self, frame: Frame) -> None:
-        """Take a frame into account."""
+        """Add a frame."""
         last, self._last = self._last, frame
         self._received.append(frame.received)
         taken = self._clock.taken(frame.received, frame.number, frame.rate)
@@ -156,7 +156,7 @@ def survey(
     clock: Clock = REAL_CLOCK,
     make_feed: Callable[[MocapUri], Feed] = Feed,
 ) -> Survey:
-    """Return a survey of all that a system sends in `seconds`; `show` gets the survey so far a few times a second.
+    """Return a survey of `seconds` of a system's stream; `show` gets the survey so far a few times a second.
 
     Raises a CfplanError if no frame comes, or if the URI names an unknown body.
     """

@@ -8,7 +8,7 @@ from urllib.parse import unquote, urlsplit
 from cfplan.errors import InputError, LinkError
 
 VICON_PORT = 801
-# Scheme and default port, 0 where the maker's client takes none.
+# Scheme and default port; 0 if the vendor's client takes none.
 SYSTEMS = {
     "vicon": VICON_PORT,  # cfplan's own client of Vicon's DataStream
     "vicon-sdk": VICON_PORT,  # the same server through Vicon's own client
@@ -20,7 +20,7 @@ SYSTEMS = {
     "vrpn": 3883,
 }
 EXAMPLE = "vicon://192.168.1.2/cf1"
-_LISTED, _LONGEST_NAME = 12, 40  # names that an error lists at most, and characters of each
+_LISTED, _LONGEST_NAME = 12, 40  # most names in an error message, and most characters of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,15 +29,15 @@ class MocapUri:
 
     system: str  # one of SYSTEMS
     host: str
-    port: int  # 0 where the maker's client takes none
-    subject: str  # "" where no body is named
+    port: int  # 0 if the vendor's client takes none
+    subject: str  # "" if no body is named
 
     def __str__(self) -> str:
         return f"{self.system}://{self.address}/{self.subject}".rstrip("/")
 
     @property
     def address(self) -> str:
-        """Return the host, with its port if that is not the usual one."""
+        """Return the host, with its port unless that is the default."""
         host = f"[{self.host}]" if ":" in self.host else self.host
         return host if self.port == SYSTEMS[self.system] else f"{host}:{self.port}"
 
@@ -82,7 +82,7 @@ def parse_uri(text: str, *, subject_needed: bool) -> MocapUri:
 
 
 def nothing_by_vrpn(uri: MocapUri, seconds: float) -> LinkError:
-    """Return the error of a silent VRPN: its client cannot tell a missing server from one without trackers."""
+    """Return the error of a silent VRPN: its client cannot distinguish a missing server from one without trackers."""
     whose = f" of {uri.subject!r}" if uri.subject else ""
     return LinkError(
         f"nothing{whose} came within {seconds:.1f} s",

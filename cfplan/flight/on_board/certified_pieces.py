@@ -1,8 +1,8 @@
-"""Pieces for the vehicle's memory that are certified as it decodes them: more of them, or slower, until they are.
+"""Certified pieces for the vehicle's memory: fitted with more pieces, or slower, until the decoded motion passes.
 
-Plans jump in angular acceleration, polynomials cannot. Where they overshoot a limit the whole is slowed: fits of
-several counts are made, each slowed until its certificate passes, and the nearest to the plan among the fastest is
-taken.
+Plans have jumps in angular acceleration, polynomials do not. If they overshoot a limit, the whole flight is slowed:
+fits with several numbers of pieces are each slowed until their certificate passes, and of the fastest ones the nearest
+to the plan is chosen.
 """
 
 import sys
@@ -33,8 +33,8 @@ from cfplan.vehicle.trajectory import Trajectory
 
 FARTHEST = 0.02  # m from the reference
 SLOWEST = 1.5  # times the plan's duration
-_COUNT_FRACTIONS = (0.25, 0.5, 0.75, 1.0)  # of the pieces that there may be, that are tried
-_DURATION_TOLERANCE = 1.01  # times the least duration, within which the nearest to the plan is preferred
+_COUNT_FRACTIONS = (0.25, 0.5, 0.75, 1.0)  # of the largest number of pieces, to be tried
+_DURATION_TOLERANCE = 1.01  # times the least duration; within this the fit nearest to the plan is chosen
 _LENGTHS = (
     1.2,
     1.0,
@@ -45,26 +45,26 @@ _LENGTHS = (
     0.5,
     0.4,
 )  # s of a compressed piece, about: shorter ones suffer from whole millimetres
-_COUNTS_NEAR_FULL = 2  # pieces fewer than those that fill the memory: a few more or less fit better or worse
+_COUNTS_NEAR_FULL = 2  # numbers of pieces below the largest that fits, to be tried too, as fits vary
 _MAX_COUNT_FACTOR, _COUNT_FACTOR_STEP = (
     3.0,
     0.05,
 )  # times as many pieces as there may be, that are sought for how long may fly
-_COARSE = 0.004  # s between samples while the slowing is searched for
+_COARSE = 0.004  # s between samples in the search for the slowing
 _HALVINGS = 7
 _SLOWING_STEP, _SLOWING_ATTEMPTS = 1.003, 6  # where the fine certificate does not pass at what the coarse one found
 
 
 @dataclass(frozen=True, slots=True)
 class OnBoardTrajectory:
-    """A trajectory in the vehicle's memory, and what it decodes from that."""
+    """A trajectory in the vehicle's memory, and its decoded pieces."""
 
     memory: bytes  # from byte 0 of the memory on; empty where there are more pieces than it holds
     compressed: bool
     pieces: Pieces
     certificate: Certificate  # of the pieces
-    reference: PolynomialReference  # what was fitted
-    error: float  # m, farthest from the reference
+    reference: PolynomialReference  # of the fit
+    error: float  # m, largest deviation from the reference
 
     @property
     def duration(self) -> float:
@@ -92,9 +92,9 @@ def certified_pieces(
 ) -> OnBoardTrajectory:
     """Return at most `most` pieces, uncompressed, that fly a trajectory within the limits.
 
-    `leads` puts them ahead of it, so that the vehicle, which drag holds back, is on it, see reference.py; a correction
-    adds what a dry run of others showed. Raises NotCertifiedError where they would stray by more than FARTHEST from
-    what they are to be, or take longer than SLOWEST times as long.
+    `leads` puts them ahead of the trajectory to compensate for drag, see reference.py; `correction` is learned from a
+    dry run without it. Raises NotCertifiedError if they deviate by more than FARTHEST from the reference, or take more
+    than SLOWEST times as long.
     """
 
     def fit_of(knots_of: Callable[[PolynomialReference, int], NDArray], count: int) -> _Fit:
@@ -123,7 +123,7 @@ def certified_compressed(
 ) -> OnBoardTrajectory:
     """Return compressed pieces that fly a trajectory within the limits, in `room` bytes at most.
 
-    Raises NotCertifiedError as above; for a flight too long for the room with what would fit.
+    Raises NotCertifiedError as above; for a flight that is too long, its message says what would fit.
     """
 
     def fit_of(count: int) -> _Fit:
@@ -163,8 +163,8 @@ def _max_count_that_fits(reference: PolynomialReference, count: int, room: int) 
 
 
 def _longest_flight_that_fits(reference: PolynomialReference, count: int, room: int) -> float:
-    """Return how long, s, a flight like this may be for pieces that are near enough to fit; 0 where that is no matter
-    of room: `count` pieces do.
+    """Return the longest such flight, s, that fits the memory; 0 if memory is not the problem: `count` pieces are near
+    enough.
     """
     for share in np.arange(1.0, _MAX_COUNT_FACTOR, _COUNT_FACTOR_STEP):
         made = _compressed(reference, round(share * count), sys.maxsize)
@@ -174,9 +174,9 @@ def _longest_flight_that_fits(reference: PolynomialReference, count: int, room: 
 
 
 def _best(fits_tried: Iterable[_Fit], reference: PolynomialReference, limits: Limits, room: str) -> OnBoardTrajectory:
-    """Return the nearest to the reference among the fastest that pass. Raises NotCertifiedError where none does."""
+    """Return the nearest to the reference among the fastest that pass. Raises NotCertifiedError if none does."""
     good: list[OnBoardTrajectory] = []
-    flaws: list[tuple[float, str]] = []  # how bad, and what
+    flaws: list[tuple[float, str]] = []  # severity and text
     for make in fits_tried:
         try:
             made = _certified(make, reference, limits)
@@ -197,7 +197,7 @@ def _best(fits_tried: Iterable[_Fit], reference: PolynomialReference, limits: Li
 
 
 def _certified(make: _Fit, reference: PolynomialReference, limits: Limits) -> OnBoardTrajectory:
-    """Return what is made at about the least slowing at which its certificate passes, if it does at all."""
+    """Return the fit with about the least slowing at which its certificate passes, if there is one."""
     samples = sample_pieces(make(reference).pieces, _COARSE)
     slowing = _least_slowing(
         lambda factor: certify_samples(samples.slowed(factor), limits.airframe, limits.plan).passed
@@ -215,14 +215,14 @@ def _certified(make: _Fit, reference: PolynomialReference, limits: Limits) -> On
 
 
 def _error(pieces: Pieces, reference: PolynomialReference) -> float:
-    """Return the farthest that pieces are from their reference, m."""
+    """Return the largest deviation of pieces from their reference, m."""
     samples = sample_pieces(pieces, _COARSE)
     deviation = samples.derivatives[:, 0, :3] - reference.at(samples.time)[:, 0, :3]
     return float(np.linalg.norm(deviation, axis=1).max())
 
 
 def _rejection(made: OnBoardTrajectory) -> str:
-    """Return why a trajectory may not fly; empty where it may."""
+    """Return why a trajectory is rejected; empty if it is not."""
     if not made.error <= FARTHEST:
         return f"polynomials stray {made.error:.2f} m from the plan, {FARTHEST:g} m are allowed"
     worst = made.certificate.worst
@@ -232,7 +232,7 @@ def _rejection(made: OnBoardTrajectory) -> str:
 
 
 def _least_slowing(passes: Callable[[float], bool]) -> float:
-    """Return the least factor from 1 to SLOWEST at which something passes, found by halving; SLOWEST where none is."""
+    """Return the least factor from 1 to SLOWEST at which something passes, by bisection; SLOWEST if there is none."""
     if passes(1.0):
         return 1.0
     low, high = 1.0, SLOWEST

@@ -1,10 +1,10 @@
-"""Learned correction of an on-board reference: what the vehicle strayed by in a dry run, taken back ahead of time.
+"""Learned correction of an on-board reference: it subtracts the deviation of a dry run, ahead of time.
 
-The lead of reference.py takes attitude for what the controller asks for. Motors follow late, so attitude and thrust do
-too, most where both change fast, as at the top of a loop: there the vehicle strays by 5 cm at a motor lag of 0.1 s. A
-streamed setpoint says thrust and rates ahead of time; a polynomial has its place alone. So one step of iterative
+The lead of reference.py assumes that attitude and thrust are those that the controller commands. With motor lag they
+are late, most where both change fast: at the top of a loop the vehicle deviates by 5 cm at a motor lag of 0.1 s.
+Streamed setpoints send thrust and rates ahead of time; polynomials have only positions. Therefore one step of iterative
 learning control (Bristow, Tharayil and Alleyne, "A survey of iterative learning control", 2006) shifts the reference by
-what it was off, as a spline too slow to excite the controller: with knots 0.2 s apart a second step makes it worse.
+the deviation, as a spline too slow to excite the controller: with knots 0.2 s apart a second step makes it worse.
 """
 
 from dataclasses import dataclass
@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-_LEAD = 0.1  # s by which a shift is ahead of what it takes back, about as late as the vehicle follows one
+_LEAD = 0.1  # s by which the shift leads the deviation, about the vehicle's delay in following it
 _SPACING = 0.25  # s between knots
-_DEGREE = 7  # so that four derivatives are smooth
-_REST = 5  # coefficients at both ends that are 0, so that the shift and four derivatives are
+_DEGREE = 7  # for four smooth derivatives
+_REST = 5  # zero coefficients at each end, for a zero shift with four derivatives
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,8 +38,8 @@ class Correction:
 
 
 def correct(times: NDArray, deviation: NDArray, duration: float) -> Correction:
-    """Return what takes back by how much the vehicle strayed, (N, 3) m at times, (N,) s, of a flight of `duration`, s,
-    that flew without a correction.
+    """Return the correction of a deviation, (N, 3) m at times, (N,) s, in a flight of `duration`, s, that flew without
+    one.
     """
     rows = np.arange(0.0, duration, times[1] - times[0])
     wanted = -np.stack([np.interp(rows + _LEAD, times, along) for along in deviation.T], axis=1)

@@ -1,12 +1,12 @@
-"""The fall that ends an on-board flight whose link dies: where the vehicle meets the floor once its watchdog acts.
+"""Fall after link loss in an on-board flight: where the vehicle lands once its watchdog stops the motors.
 
-Until then its commander flies on, for a second and blind: an attitude, a velocity and a vertical acceleration that it
-has wrong by as much as safety.yaml says carry it off its way, to any side. Then the motors stop. They do so with a lag
-τ, in which the specific thrust f = a + g fades; so from the state p, v, a
+Before that its commander flies on blind for a second. Errors of attitude, velocity and vertical acceleration as large
+as safety.yaml allows displace it in any direction. Then the motors stop with a lag τ, during which the specific thrust
+f = a + g decays; so from the state p, v, a
 
     p(t) = p + v t + ½ g t² + f τ (t - τ (1 - exp(-t/τ)))
 
-to the floor, for no lag and for the longest. Drag, which would hold the vehicle back, is left out.
+down to the floor, for no lag and for the longest one. Drag, which would slow the vehicle, is neglected.
 """
 
 import math
@@ -20,7 +20,7 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES
 from cfplan.vehicle.airframe import GRAVITY
 
-_LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; moments that are looked at
+_LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; number of moments computed
 _PARTS = tuple(slice(begin, begin + 9) for begin in range(0, _MOMENTS - 1, 8))
 """Moments of each part of a fall; with obstacles each part has its own box. Neighbouring parts share a moment."""
 _G = np.array([0.0, 0.0, GRAVITY])
@@ -37,7 +37,7 @@ class Falls:
 
     @property
     def worst(self) -> int:
-        """Return the number of the state that ends farthest out; what is not a number is farthest."""
+        """Return the number of the state that ends farthest out; NaN counts as farthest."""
         return int(np.argmax(np.where(np.isnan(self.beyond), np.inf, self.beyond)))
 
 
@@ -65,7 +65,7 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
         for part, some in enumerate(_PARTS if limits.space.obstacles else (slice(None),)):
             boxes[:, part, 0] = np.minimum(boxes[:, part, 0], low[:, some].min(axis=1))
             boxes[:, part, 1] = np.maximum(boxes[:, part, 1], high[:, some].max(axis=1))
-    for part in range(1, boxes.shape[1]):  # where it lies on the floor already
+    for part in range(1, boxes.shape[1]):  # the rest of the fall, if it is on the floor already
         boxes[:, part] = np.where(
             boxes[:, part] == (np.array([np.inf, -np.inf])[:, None]), boxes[:, part - 1], boxes[:, part]
         )
@@ -79,7 +79,7 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
 
 
 def _astray(limits: Limits, time: NDArray) -> tuple[NDArray, float]:
-    """Return how far, m, it is off its way after a blind second and a fall of `time`, s: aside, and upwards."""
+    """Return the displacement, m, after a blind second and a fall of `time`, s: sideways, and upwards."""
     (attitude_error, velocity_error), blind = estimate_errors(limits), Timeouts().watchdog_at_latest
     push = GRAVITY * math.tan(attitude_error)
     aside = velocity_error * blind + 0.5 * push * blind**2

@@ -1,17 +1,16 @@
 """Fitting of polynomials: pieces of degree 7 that follow a reference's position, acceleration, jerk and snap.
 
-Where two pieces meet, they have position, velocity, acceleration and jerk in common, and these are the unknowns of a
-least-squares problem, a banded one; at both ends of the flight they are those of a hover. Knots are moved to where the
-fit is worst.
+Adjacent pieces share position, velocity, acceleration and jerk at their joint. These are the unknowns of a banded
+least-squares problem; at both ends of the flight they are those of a hover. Knots are moved to where the fit is worst.
 
-Compressed pieces last equally long, so that what two of them have in common are whole numbers: position p, and the
-differences d₁, d₂, d₃ of their control points there. With duration T, in steps of 1 mm,
+Compressed pieces have equal durations, so the shared values are integers: position p, and the differences d₁, d₂, d₃ of
+the control points at the joint. With duration T, in steps of 1 mm,
 
     velocity = 7 d₁ / T      acceleration = 42 d₂ / T²      jerk = 210 d₃ / T³
 
-so they meet as smoothly as if nothing had been rounded. The whole numbers are those of the nearest-plane method (Babai,
-"On Lovász' lattice reduction and the nearest lattice point problem", 1986): rounded one by one, from the last to the
-first, each after what those before it were rounded by has been made up for.
+so joints stay smooth in spite of rounding. The integers come from the nearest-plane method (Babai, "On Lovász' lattice
+reduction and the nearest lattice point problem", 1986): they are rounded one by one, from the last to the first, and
+each compensates for the rounding of those before.
 """
 
 import numpy as np
@@ -23,24 +22,24 @@ from cfplan.flight.on_board.pieces import COUNT, Pieces
 from cfplan.flight.on_board.reference import PolynomialReference
 from cfplan.geometry.polynomials import hermite
 
-ENDS = 4  # numbers that two pieces have in common: position and three derivatives
-# How much an error of each derivative counts: 1 m/s² as much as 3 cm, 5 m/s³ and 50 m/s⁴; of yaw in rad, likewise.
+ENDS = 4  # values that adjacent pieces share: position and three derivatives
+# Weight of an error in each derivative: 1 m/s² counts like 3 cm, 5 m/s³ and 50 m/s⁴; of yaw in rad likewise.
 _WEIGHTS = {0: 30.0, 2: 1.0, 3: 0.2, 4: 0.02}
 _YAW_WEIGHTS = {0: 30.0, 2: 1.0}
-_POINTS = 16  # at which a piece is compared, at Gauss's places
-_ROUNDS = 3  # of moving knots
-_EVENNESS = 0.2  # power of a piece's error by which knots are drawn to it
+_POINTS = 16  # Gauss points per piece for the comparison
+_ROUNDS = 3  # rounds of moving knots
+_EVENNESS = 0.2  # power of a piece's error by which it attracts knots
 _HERMITE = hermite(ENDS)
 _BEZIER = np.array([1.0, 7.0, 42.0, 210.0])  # derivatives on [0, 1] per difference of control points
 
 
 def even_knots(reference: PolynomialReference, count: int) -> NDArray:
-    """Return the ends, (count + 1,) s, of pieces that last equally long."""
+    """Return the knots, (count + 1,) s, of pieces of equal duration."""
     return np.linspace(0.0, reference.duration, count + 1)
 
 
 def drawn_knots(reference: PolynomialReference, count: int) -> NDArray:
-    """Return the ends, (count + 1,) s, of pieces that are the shorter the worse they fit."""
+    """Return the knots, (count + 1,) s, of pieces that are shorter where they fit worse."""
     knots = even_knots(reference, count)
     for _ in range(_ROUNDS):
         error = _Problem(reference, knots).errors()
@@ -78,7 +77,7 @@ def fit_control_points(reference: PolynomialReference, count: int) -> ControlPoi
 
 
 class _Problem:
-    """Least squares over what is common to pieces with these knots, (K + 1,) s."""
+    """Least-squares problem for the shared values of pieces with these knots, (K + 1,) s."""
 
     def __init__(self, reference: PolynomialReference, knots: NDArray):
         self.durations = np.diff(knots)
@@ -121,8 +120,8 @@ class _Problem:
         return np.concatenate(parts, axis=2)
 
     def _solve(self, targets: NDArray, weights: dict[int, float], ends: NDArray, integer: bool = False) -> NDArray:
-        """Return what pieces have in common, (K + 1, 4, D), for targets (K, _POINTS, 5, D); as whole numbers of
-        differences of control points, or as derivatives by time.
+        """Return the shared values, (K + 1, 4, D), for targets (K, _POINTS, 5, D), as integer differences of control
+        points or as derivatives by time.
         """
         count, axes = len(self.durations), targets.shape[-1]
         size = ENDS * (count + 1)
@@ -155,7 +154,7 @@ def _inner(bands: NDArray, right: NDArray, fixed: NDArray, integer: bool) -> NDA
         value = bands[2 * ENDS - 1 - shift, shift:][:, None]
         pulled[column - shift] -= value * np.where((column >= size - ENDS)[:, None], fixed[column], 0.0)
         pulled[column] -= value * np.where((column - shift < ENDS)[:, None], fixed[column - shift], 0.0)
-    width = min(2 * ENDS, size - 2 * ENDS)  # bands of what is left
+    width = min(2 * ENDS, size - 2 * ENDS)  # bands of the remaining unknowns
     bands, pulled = bands[2 * ENDS - width :, ENDS:-ENDS].copy(), pulled[ENDS:-ENDS]
     scale = 1.0 / np.sqrt(bands[-1])
     for shift in range(width):
@@ -171,7 +170,7 @@ def _inner(bands: NDArray, right: NDArray, fixed: NDArray, integer: bool) -> NDA
 
 
 def _rounded(exact: NDArray, upper: NDArray) -> NDArray:
-    """Return whole numbers near `exact`, (N, D), in the metric of an upper triangle's bands: the nearest plane's."""
+    """Return integers near `exact`, (N, D), in the metric of a banded upper triangle, by the nearest-plane method."""
     out, shift = np.zeros_like(exact), np.zeros_like(exact)
     last = len(upper) - 1
     for n in range(len(exact) - 1, -1, -1):

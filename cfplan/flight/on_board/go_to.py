@@ -1,4 +1,4 @@
-"""Go-to on board: the polynomial by which the high-level commander flies to a place, and stops that are flown by it.
+"""On-board go-to: the polynomial by which the high-level commander flies to a place, and stops made with it.
 
 From any state of its own (position p, velocity v, acceleration a, of x, y, z and yaw) the commander plans a polynomial
 of degree 7 to a rest at the target; its jerk is zero at both ends (src/modules/src/planner.c, plan_go_to_from, and
@@ -6,7 +6,7 @@ pptraj.c, poly4d_set_no_jerk). With u = t/T from 0 to 1:
 
     x(u) = p + vT u + ½aT² u² + c₄u⁴ + c₅u⁵ + c₆u⁶ + c₇u⁷
 
-A stop goes to the target that makes the integral of the squared jerk least: p + ½ vT + 5/56 aT².
+A stop flies to the target with the least integral of squared jerk: p + ½ vT + 5/56 aT².
 """
 
 from math import factorial
@@ -21,7 +21,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import about_z, quaternions_of
 
 STOP_DURATION = 1.0  # s
-"""From 2 m/s the vehicle brakes by 3.8 m/s² and rests 1 m on; on all of flights/ that keeps what stops may reach."""
+"""From 2 m/s the vehicle brakes at 3.8 m/s² and stops within 1 m; on all of flights/ this keeps the limits of stops."""
 _ORDERS = 5  # position to snap
 _UPPER = np.linalg.inv(np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float))
 
@@ -62,7 +62,7 @@ def stop_targets(begin: NDArray, duration: float = STOP_DURATION) -> NDArray:
 
 
 def motion_of(states: NDArray, airframe: Airframe) -> FullStateSetpoints:
-    """Return the motion of states, (N, 5, 4), as setpoints would have it: N rows, drag in the acceleration."""
+    """Return the motion of states, (N, 5, 4), as setpoints: N rows, with drag compensation in the acceleration."""
     velocity, acceleration, yaw = states[:, 1, :3], states[:, 2, :3], states[:, 0, 3]
     pushed = acceleration + airframe.drag[0] / airframe.mass * velocity
     attitude = controller_attitude(pushed + np.array([0.0, 0.0, GRAVITY]), about_z(yaw))

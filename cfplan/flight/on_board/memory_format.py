@@ -1,11 +1,11 @@
-"""The firmware's trajectory memory: 4,096 bytes that hold pieces as they are, or compressed.
+"""The firmware's trajectory memory: 4,096 bytes of raw or compressed pieces.
 
-As they are (poly4d): 8 float32 coefficients each of x, y, z and yaw, and a float32 duration; 132 bytes, so 31 pieces.
+Raw (poly4d): 8 float32 coefficients each of x, y, z and yaw, and a float32 duration; 132 bytes, so 31 pieces.
 
-Compressed (src/modules/src/pptraj_compressed.c): x, y, z in mm and yaw in 0.1°, int16, where it starts; then of each
-piece a byte with two bits an axis, which say whether 0, 1, 3 or 7 Bézier control points follow, a uint16 duration in
-ms, and those points. The first control point of a piece is where the piece before ended. A piece of no duration ends
-it; without that, the firmware reads on in whatever lies behind.
+Compressed (src/modules/src/pptraj_compressed.c): x, y, z in mm and yaw in 0.1°, int16, of the start; then for each
+piece a byte with two bits per axis for the number of Bézier control points (0, 1, 3 or 7), a uint16 duration in ms, and
+those points. The first control point of a piece is the end of the piece before. A piece of zero duration ends the
+trajectory; without it, the firmware would read on into the bytes behind.
 """
 
 import struct
@@ -21,7 +21,7 @@ from cfplan.flight.on_board.pieces import AXES, COUNT, Pieces
 MEMORY_SIZE = 4096  # bytes
 PIECE_SIZE = 4 * (AXES * COUNT + 1)  # bytes
 MOST_PIECES = MEMORY_SIZE // PIECE_SIZE
-POINTS = COUNT - 1  # control points of a piece that are stored, at most
+POINTS = COUNT - 1  # most stored control points of a piece
 STEPS = np.array([1e-3, 1e-3, 1e-3, np.radians(0.1)])  # m, m, m, rad: one in a stored control point
 LONGEST = 65.535  # s, of a compressed piece
 _POINTS_OF_TYPE = (0, 1, 3, POINTS)
@@ -29,12 +29,12 @@ _SCALES = np.array([1000.0, 1000.0, 1000.0, np.float32(1800.0) / np.float32(np.p
 _HEADER = struct.Struct("<BH")
 _START = struct.Struct("<4h")
 START_SIZE = _START.size  # bytes
-END = _HEADER.pack(0, 0)  # behind the last compressed piece
+END = _HEADER.pack(0, 0)  # after the last compressed piece
 
 
 @dataclass(frozen=True, slots=True)
 class ControlPoints:
-    """Compressed pieces, before they are bytes."""
+    """Compressed pieces, before encoding."""
 
     start: NDArray  # (4,) in STEPS
     durations: NDArray  # (K,) ms
@@ -42,13 +42,13 @@ class ControlPoints:
 
     @property
     def moves(self) -> NDArray:
-        """Return whether each axis moves in each piece, (K, 4): where it rests, nothing need be stored."""
+        """Return whether each axis moves in each piece, (K, 4): an axis at rest needs no points."""
         before = np.concatenate([self.start[None], self.points[:-1, :, -1]])
         return np.asarray((self.points != before[:, :, None]).any(axis=2))
 
 
 def raw_bytes(pieces: Pieces) -> bytes:
-    """Return pieces as the memory holds them. Raises NotCertifiedError where there are more than it can."""
+    """Return the bytes of raw pieces. Raises NotCertifiedError if there are too many."""
     count = len(pieces.durations)
     if count > MOST_PIECES:
         raise NotCertifiedError(
@@ -60,7 +60,7 @@ def raw_bytes(pieces: Pieces) -> bytes:
 
 
 def read_raw(memory: bytes, count: int, offset: int = 0) -> Pieces:
-    """Return `count` pieces as the firmware reads them. Raises NotCertifiedError where they are none."""
+    """Return `count` pieces as the firmware reads them. Raises NotCertifiedError if they are invalid."""
     if not 0 < count * PIECE_SIZE <= len(memory) - offset:
         raise NotCertifiedError(
             f"{count} pieces from byte {offset} on do not lie in {len(memory)} bytes", where="trajectory memory",
@@ -71,14 +71,14 @@ def read_raw(memory: bytes, count: int, offset: int = 0) -> Pieces:
 
 
 def compressed_size(moves: NDArray) -> int:
-    """Return the bytes of compressed pieces whose axes move or not, (K, 4)."""
+    """Return the size, in bytes, of compressed pieces whose axes move or not, (K, 4)."""
     return _START.size + len(moves) * _HEADER.size + 2 * POINTS * int(np.sum(moves)) + _HEADER.size
 
 
 def compressed_bytes(curve: ControlPoints, room: int = MEMORY_SIZE) -> bytes:
-    """Return control points as the memory holds them, in `room` bytes at most.
+    """Return the bytes of compressed pieces, at most `room`.
 
-    Raises NotCertifiedError where they do not fit these, or one its 16 bits.
+    Raises NotCertifiedError if they do not fit, or a control point does not fit 16 bits.
     """
     moves = curve.moves
     size = compressed_size(moves)
@@ -103,7 +103,7 @@ def compressed_bytes(curve: ControlPoints, room: int = MEMORY_SIZE) -> bytes:
 def read_compressed(memory: bytes, offset: int = 0) -> Pieces:
     """Return compressed pieces as the firmware reads them, rounded to float32 where it rounds.
 
-    Raises NotCertifiedError where they do not end within the memory, or there is none.
+    Raises NotCertifiedError if they do not end within the memory, or there is no piece.
     """
     durations, coefficients = [], []
     try:

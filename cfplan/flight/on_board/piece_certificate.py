@@ -1,9 +1,9 @@
-"""The certificate of on-board pieces: the motion that a vehicle must make to fly what it decoded, held to every limit.
+"""Certificate of on-board pieces: checks the motion of the decoded pieces against every limit.
 
-The commander asks for position, velocity and acceleration, and for the yaw at which the controller turns its x axis; so
-the attitude is that with z along the thrust and y along z × [cos yaw, sin yaw, 0]. Thrust, attitude, body rates and
-motor thrusts follow from the pieces' derivatives up to snap, drag and the moment by velocity included. Samples and the
-allowance for what lies between them are those of the certificate of trajectories.
+The commander commands position, velocity, acceleration and yaw, by which the controller turns its x axis. So the
+attitude has z along the thrust and y along z × [cos yaw, sin yaw, 0]. Thrust, attitude, body rates and
+motor thrusts follow from the pieces' derivatives up to snap, including drag and the moment by velocity. Samples and the
+allowance between them are those of the certificate of trajectories.
 """
 
 import math
@@ -34,19 +34,19 @@ from cfplan.vehicle.flatness import motor_thrusts
 from cfplan.vehicle.measures import measures_of
 
 _ALLOWANCE = 2.0 / 8.0  # of the second difference, twice what is needed
-# What position, velocity, acceleration and jerk may jump by between two pieces: roundings of float32, and of the time.
+# Tolerated jumps of position, velocity, acceleration and jerk between pieces: rounding of float32 and of time.
 _JOINT_TOLERANCES = np.array([1e-4, 1e-3, 0.01, 0.5])
 _NAMES = ("position", "velocity", "acceleration", "jerk")
 _UNITS = ("m", "m/s", "m/s²", "m/s³")
-# m, m/s, m/s², rad/s, by which float32 may be off: time alone is, by 0.1 ms after a minute of pieces.
+# m, m/s, m/s², rad/s: tolerated errors of float32; after a minute time alone is off by 0.1 ms.
 _ROUNDING_TOLERANCES = np.array([5e-4, 1e-3, 0.01, 0.05])
 _JOINT_OFFSET = 1e-4  # s
-_STEP = 0.0101  # s between moments at which its arithmetic is looked at
+_STEP = 0.0101  # s between the moments at which arithmetic is compared
 
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """Closely spaced moments of pieces, both ends of each included."""
+    """Closely spaced samples of pieces, including both ends of each."""
 
     time: NDArray  # (N,) s
     derivatives: NDArray  # (N, 5, 4): position and yaw, and four derivatives by time
@@ -72,9 +72,9 @@ def sample_pieces(pieces: Pieces, step: float = TIME_STEP) -> Samples:
 
 
 def certify_pieces(pieces: Pieces, airframe: Airframe, limits: PlanLimits, space: Space | None = None) -> Certificate:
-    """Check every limit, and the space where given, everywhere along the pieces.
+    """Check every limit, and the space if given, everywhere along the pieces.
 
-    Raises NotCertifiedError where two pieces do not meet, or the commander's float32 would say something else.
+    Raises NotCertifiedError if two pieces do not meet, or if the commander's float32 arithmetic differs too much.
     """
     check_joints(pieces)
     check_arithmetic(pieces)
@@ -101,7 +101,7 @@ def _path_of(pieces: Pieces) -> Path:
 
 
 def certify_samples(samples: Samples, airframe: Airframe, limits: PlanLimits) -> Certificate:
-    """Return the certificate of samples, without walls and obstacles; a value that is not a number fails."""
+    """Return the certificate of samples, without walls and obstacles; NaN fails."""
     measured = measures_along(samples, airframe)
     margins = []
     for quantity in QUANTITIES:
@@ -190,7 +190,7 @@ def check_joints(pieces: Pieces) -> None:
         derivatives_of(pieces, k, np.array([0.0, float(duration)]), 4)[:, :, :3]
         for k, duration in enumerate(pieces.durations)
     ]
-    moving = np.array([1.0, 1.0, 1.0, 0.0])  # jerk may begin and end at once
+    moving = np.array([1.0, 1.0, 1.0, 0.0])  # jerk may jump at the ends
     for k in range(len(ends) + 1):
         left = ends[k - 1][1] if k else ends[0][0] * [[1], [0], [0], [0]]
         right = ends[k][0] if k < len(ends) else ends[-1][1] * [[1], [0], [0], [0]]
@@ -205,9 +205,9 @@ def check_joints(pieces: Pieces) -> None:
 
 
 def check_arithmetic(pieces: Pieces) -> None:
-    """Check that what the commander computes in float32 is what was certified. Raises NotCertifiedError."""
+    """Check that the commander's float32 arithmetic reproduces the certified motion. Raises NotCertifiedError."""
     times = np.arange(0.0, pieces.duration - _STEP, _STEP)  # at the very end float32 decides whether it has ended
-    # Next to a joint it decides which piece is flown; by how much these differ there, check_joints() bounds.
+    # Next to a joint float32 decides which piece is flown; check_joints() bounds their difference.
     times = times[np.abs(times[:, None] - pieces.begins[1:]).min(axis=1, initial=np.inf) > _JOINT_OFFSET]
     exact = np.concatenate(
         [

@@ -1,8 +1,8 @@
-"""On-board polynomials: the pieces of a trajectory as the high-level commander holds them, and as it evaluates them.
+"""On-board polynomials: the pieces of a trajectory as the high-level commander stores and evaluates them.
 
 The firmware (src/modules/src/pptraj.c) keeps durations and coefficients as float32 and evaluates them in float32 by
-Horner's rule, 100 times a second. From acceleration, jerk and yaw it makes the body rates that it sends on to the
-controller. After the last piece it hovers where that ends. Here everything is rounded where the firmware rounds it.
+Horner's rule, 100 times a second. From acceleration, jerk and yaw it computes the body rates for the
+controller. After the last piece it hovers at its end. This module rounds wherever the firmware does.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ RATE = 100.0  # Hz, at which the commander evaluates them
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """Polynomials one behind the other, each from time 0 of its own to its duration.
+    """A sequence of polynomials, each from its own time 0 to its duration.
 
-    Raises NotCertifiedError where a number is not finite as float32, or a duration not positive.
+    Raises NotCertifiedError if a number is not finite as float32, or a duration is not positive.
     """
 
     durations: NDArray  # (K,) s, float32
@@ -60,7 +60,7 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True)
 class Goals:
-    """What the commander asks the controller for at N times, float32."""
+    """The commander's goals for the controller at N times, float32."""
 
     position: NDArray  # (N, 3) m
     velocity: NDArray  # (N, 3) m/s
@@ -71,7 +71,7 @@ class Goals:
 
 
 def goals_at(pieces: Pieces, times: NDArray) -> Goals:
-    """Return what the commander makes of the pieces at times, (N,) s from the start, at least 0."""
+    """Return the commander's goals at times, (N,) s from the start, at least 0."""
     piece, left, ended = _located(pieces, np.asarray(times, dtype=np.float32))
     table = pieces.coefficients[piece]
     values = []
@@ -86,7 +86,7 @@ def goals_at(pieces: Pieces, times: NDArray) -> Goals:
 
 
 def body_rates(acceleration: NDArray, jerk: NDArray, yaw: NDArray, yaw_rate: NDArray) -> NDArray:
-    """Return the body rates, (N, 3) rad/s, that the commander sends on: without drag, in the arithmetic given."""
+    """Return the body rates, (N, 3) rad/s, for the controller: without drag, in the precision of the arguments."""
     force = acceleration + np.array([0.0, 0.0, GRAVITY], dtype=acceleration.dtype)
     size = np.sqrt((force * force).sum(axis=1))[:, None]
     z = force / size

@@ -1,8 +1,8 @@
-"""The on-board program: a trajectory for the vehicle's memory that ends in a landing, and what its pilot knows of it.
+"""On-board program: a trajectory for the vehicle's memory that ends in a landing, with the pilot's data about it.
 
-Behind the plan's pieces two more sink to the floor: quickly at first, then at a pace with which the vehicle may touch
-it, and on beneath it, so that a vehicle that stands no longer has the thrust to rise. Without its pilot it then stands,
-rather than hover until its battery is empty.
+After the plan's pieces two more descend to the floor: quickly at first, then at touchdown speed, and on below the
+floor, so that a standing vehicle no longer has the thrust to rise. Without its pilot the vehicle then stands instead of
+hovering until its battery is empty.
 """
 
 import math
@@ -27,29 +27,29 @@ from cfplan.flight.on_board.pieces import Pieces
 
 LANDING_PIECES = 2
 LANDING_SIZE = LANDING_PIECES * (3 + 2 * POINTS)  # bytes, compressed: of the height alone
-_SLOW_FROM = 0.15  # m above the floor, from which it sinks at a pace with which it may touch it
-_PERIOD = 70  # ms: durations are multiples, in which 0.1 m/s, with which it may touch the floor, is whole millimetres
-_BENEATH_FLOOR = 0.3  # m, where no thrust is left; see setpoints/descent.py
+_SLOW_FROM = 0.15  # m above the floor, from where it sinks at touchdown speed
+_PERIOD = 70  # ms: durations are multiples of this, in which 0.1 m/s, the touchdown speed, makes integer control points
+_BENEATH_FLOOR = 0.3  # m, where no thrust is left, see setpoints/descent.py
 _SHORTEST = 1.4  # s of the quick part
 
 
 @dataclass(frozen=True, slots=True)
 class OnBoardProgram:
-    """What is uploaded, and how the pilot watches it."""
+    """The uploaded trajectory, and the data by which the pilot monitors it."""
 
     memory: bytes  # from byte 0 of the trajectory memory on
     compressed: bool
     pieces: int
     begin: tuple[float, float, float, float]  # m, m, m, rad, where the first piece begins
     descent: NDArray  # (N, 29) uint8, the landing at its end as setpoints would fly it
-    falls: str  # how near to which wall the vehicle falls at the worst moment to lose its pilot
+    falls: str  # the worst fall after link loss, in words
     deviation: float  # m, from the plan, in the dry run
 
 
 def with_landing(made: OnBoardTrajectory, floor: float, mean_speed: float) -> tuple[bytes, Pieces]:
-    """Return the memory, and the pieces in it, of a trajectory that sinks at its end to a floor at `floor`, m.
+    """Return the memory and the pieces of a trajectory with a landing on a floor at `floor`, m.
 
-    The quick part of its landing has the mean speed given, m/s. Raises NotCertifiedError where it does not fit.
+    `mean_speed`, m/s, is that of the quick part. Raises NotCertifiedError if they do not fit.
     """
     last = made.pieces.coefficients[-1]
     end = _end_of(last, made.pieces.durations[-1])
@@ -59,7 +59,7 @@ def with_landing(made: OnBoardTrajectory, floor: float, mean_speed: float) -> tu
         return memory, read_compressed(memory)
     added = read_compressed(compressed_bytes(sinking))
     table = added.coefficients.copy()
-    table[:, [0, 1, 3], 0] = end[[0, 1, 3]]  # which need not be rounded here
+    table[:, [0, 1, 3], 0] = end[[0, 1, 3]]  # these are exact already
     table[:, 2, 0] += np.float32(end[2]) - added.coefficients[0, 2, 0]
     pieces = Pieces(
         np.concatenate([made.pieces.durations, added.durations]), np.concatenate([made.pieces.coefficients, table])
@@ -90,5 +90,5 @@ def _sinking(end: NDArray, floor: float, mean_speed: float) -> ControlPoints:
 
 
 def _joined(memory: bytes, sinking: ControlPoints) -> bytes:
-    """Return compressed memory with more pieces behind its own, which begin where those end."""
+    """Return compressed memory with more pieces appended, which begin where the first ones end."""
     return memory[: -len(END)] + compressed_bytes(sinking)[START_SIZE:]

@@ -1,15 +1,15 @@
-"""The reference of on-board polynomials: a plan, slowed if need be, and ahead of it what makes the vehicle fly it.
+"""Reference of on-board polynomials: a plan, slowed if necessary, with a lead that makes the vehicle fly the plan.
 
-A streamed setpoint's acceleration makes up for drag. That of a polynomial is that of its positions, so the vehicle
-would trail behind by drag over stiffness, 7 cm at 2 m/s. But where the controller is known, so is the reference that
-makes it fly the plan: with e ahead of the plan, and F = m a + kp e + kd e' + ki ∫e what the controller asks for,
+The acceleration of a streamed setpoint compensates for drag. That of a polynomial follows from its positions, so the
+vehicle would lag by drag over stiffness, 7 cm at 2 m/s. For a known controller the reference that makes it fly the plan
+is known too: with a lead e, and F = m a + kp e + kd e' + ki ∫e the controller's command,
 
     m e'' + kd e' + kp e + ki ∫e = (drag) v + L m a'
 
-where L, along z alone, is for the lag with which motors give a thrust that changes. e is zero before the flight, and
-fades out behind it, as the controller's integral takes ten seconds to forget it.
+where L, along z only, is for the lag of the motors. e is zero before the flight and fades out after it, as the
+controller's integral takes ten seconds to decay.
 
-That takes attitude for what the controller asks for. What it leaves is learned in a dry run, see correction.py.
+This assumes that attitude is as commanded. The remaining deviation is learned in a dry run, see correction.py.
 """
 
 from dataclasses import dataclass, field
@@ -25,20 +25,20 @@ from cfplan.flight.on_board.correction import Correction
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
-TAIL = 1.0  # s behind the plan in which the reference comes back to its end
-HALF_TICK = 0.005  # s by which the commander's goals are late in the mean, as each is held for 10 ms
-LIFT_LAG = 0.5  # times the motors' time constant: L. In the simulator more slows flights and gains nothing
+TAIL = 1.0  # s after the plan, in which the lead fades out
+HALF_TICK = 0.005  # s, mean delay of the commander's goals, as each is held for 10 ms
+LIFT_LAG = 0.5  # times the motors' time constant, for L; in the simulator more slows flights without gain
 _STEP = 1e-3  # s
 
 
 @dataclass(frozen=True, slots=True)
 class PolynomialReference:
-    """What polynomials are fitted to, at any time."""
+    """The motion to which polynomials are fitted, at any time."""
 
     trajectory: Trajectory
     slowing: float = 1.0  # times the plan's duration
-    leads: bool = False  # whether it is ahead of the plan, for the firmware's Mellinger controller
-    correction: Correction | None = None  # of what the lead leaves
+    leads: bool = False  # whether it leads the plan, for the firmware's Mellinger controller
+    correction: Correction | None = None  # of the deviation that remains with the lead
     _ahead: NDArray = field(init=False, repr=False)  # (N, 5, 3): e and its derivatives, every _STEP
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class PolynomialReference:
         return np.asarray(out / self.slowing ** np.arange(5)[:, None])
 
     def at(self, times: NDArray) -> NDArray:
-        """Return what to fit, (N, 5, 4) as plan_at() does; yaw's third and fourth derivatives are 0."""
+        """Return the motion to fit, (N, 5, 4) like plan_at(); yaw's third and fourth derivatives are 0."""
         if not self.leads:
             return self.plan_at(times)
         out = self.plan_at(times + HALF_TICK)
@@ -87,7 +87,7 @@ class PolynomialReference:
         return np.array([[*first.position, first.yaw], [*last.position, last.yaw]])
 
     def _find_lead(self) -> NDArray:
-        """Return e and four derivatives by the transfer functions from what pulls to e, (N, 5, 3)."""
+        """Return e and four derivatives, (N, 5, 3), by the transfer functions from the disturbing forces."""
         airframe = self.trajectory.airframe
         plan = self.plan_at(np.arange(int(np.ceil(self.duration / _STEP)) + 2) * _STEP + HALF_TICK)[:, :, :3]
         out = np.zeros_like(plan)
@@ -113,13 +113,13 @@ class PolynomialReference:
 
 
 def _fading(place: NDArray) -> list[NDArray]:
-    """Return what falls from 1 at place 0 to 0 at place 1, and four derivatives, all of which are 0 at both ends."""
+    """Return a blend from 1 at place 0 to 0 at place 1, and four derivatives, which are 0 at both ends."""
     fall = Polynomial([1.0, 0, 0, 0, 0, -126.0, 420.0, -540.0, 315.0, -70.0])
     return [fall.deriv(order)(place) if order else fall(place) for order in range(5)]
 
 
 def _stiffness(airframe: Airframe, axis: int) -> tuple[float, float, float, float]:
-    """Return mass, and what the controller gives per m/s, m and m s of error, along an axis."""
+    """Return mass, kd, kp and ki, along an axis."""
     gains = gains_for(airframe)
     if axis < 2:
         return gains.mass, gains.kd_xy, gains.kp_xy, gains.ki_xy

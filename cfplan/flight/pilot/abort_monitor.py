@@ -19,26 +19,26 @@ from cfplan.safety.limits import Ladder, Limits
 from cfplan.safety.quantities import ON_LADDER
 from cfplan.safety.space import inside
 
-LATEST_SETPOINT = 0.25  # s that a setpoint may be late; the vehicle stops following after 0.5 s
-DISAGREEMENT_FACTOR = 5.0  # times preflight's limit that estimate and pose may be apart in the air
-FALLEN = 0.15  # m below its setpoint, of a vehicle on the floor that got there without being asked
+LATEST_SETPOINT = 0.25  # s, latest setpoint; the vehicle stops following after 0.5 s
+DISAGREEMENT_FACTOR = 5.0  # times preflight's limit on the distance between estimate and pose, in the air
+FALLEN = 0.15  # m below its setpoint, from which a vehicle on the floor counts as fallen
 
 
 @dataclass(slots=True)
 class Observation:
-    """What the pilot knows at one moment, in s on the clock of time.monotonic(), m, and radians."""
+    """The pilot's observations at one moment, in s on the clock of time.monotonic(), m, and radians."""
 
     now: float  # s
     pose: Pose | None = None  # the last good one
-    pose_fault: str = ""  # why none has come since
+    pose_fault: str = ""  # why there has been none since
     health: Health = field(default_factory=Health)
     setpoint_at_pose: Triple | None = None
-    """m, where the vehicle should have been when the pose was taken; None where no setpoint says so."""
+    """m, setpoint at the time of the pose; None if there was none."""
     estimate: Estimate | None = None  # None while its log is gone
     setpoint_at_estimate: Triple | None = None
-    """m, where the vehicle should have been at the time of its estimate; None where no setpoint says so."""
+    """m, setpoint at the time of the estimate; None if there was none."""
     status: VehicleStatus | None = None  # None while its log is gone
-    late: float = 0.0  # s, by which the last setpoint missed its deadline
+    late: float = 0.0  # s, lateness of the last setpoint
 
 
 # The measured value of each quantity that has a ladder; None while the log that reports it is gone.
@@ -137,16 +137,16 @@ class AbortMonitor:
             yield self._lasting(quantity.name, observation.now, exceeded)
 
     def _fallen(self, observation: Observation) -> Iterator[Abort]:
-        """Yield that a vehicle without poses lies on the floor: what it believes after that is worth nothing."""
+        """Yield the abort of a vehicle without poses that has fallen to the floor, where its estimate is worthless."""
         estimate, setpoint = observation.estimate, observation.setpoint_at_estimate
         if estimate is None or setpoint is None or observation.health.poses is FRESH:
             return
         floor, below = self._limits.space.low[2], setpoint[2] - estimate.position[2]
-        if estimate.position[2] < floor < setpoint[2] and below > FALLEN:  # landings ask for places beneath the floor
+        if estimate.position[2] < floor < setpoint[2] and below > FALLEN:  # setpoints of landings are below the floor
             yield AbortReason.FALLEN.abort(Rung.CUT, metres=below)
 
     def _beyond_fence(self, position: Triple) -> float:
-        """Return how far, m, a position is beyond a wall or into an obstacle less the margin; no floor counts."""
+        """Return how far, m, a position is beyond the fence: walls and obstacles less the margin, without the floor."""
         return float(self._limits.space.nearest(np.array([position]), floor=False)[0][0])
 
     def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
@@ -178,7 +178,7 @@ _NO_ABORT = Abort(Rung.NONE, ExitCode.OK, "")
 def _ladder_abort(ladder: Ladder, value: float, reason: AbortReason, **texts: str) -> Abort:
     """Return the abort of a measured value, with the value in its message.
 
-    Not a number means that the measurement cannot be trusted: land.
+    NaN means that the measurement cannot be trusted: land.
     """
     if value <= ladder.brake:
         return _NO_ABORT

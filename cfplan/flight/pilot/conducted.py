@@ -1,4 +1,4 @@
-"""What a pilot of a fleet hears from the conductor, and tells it. A single vehicle has no conductor.
+"""Messages between the pilots of a fleet and their conductor. A single vehicle has no conductor.
 
 The conductor clears each vehicle to arm, to take off and to begin its plan; the pilot waits in ticks until then, so
 poses flow and the abort monitor watches. From the order to brake on, or after a silence, the pilot brakes along its

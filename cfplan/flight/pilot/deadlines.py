@@ -17,7 +17,7 @@ class Lateness:
     p99: float  # s
     max: float  # s
     count: int
-    skipped: int  # deadlines that passed without a setpoint; the clock chose a later one
+    skipped: int  # deadlines that passed without a setpoint
 
     @classmethod
     def of(cls, late: Sequence[float], skipped: int) -> "Lateness":
@@ -41,9 +41,9 @@ class Deadlines:
         return self._first + (max(self._count, passed) + 1) * self._period
 
     def wait(self, meanwhile: Callable[[float], None] = lambda due: None) -> float:
-        """Sleep until the next deadline that is still to come; return its time, s.
+        """Sleep until the next deadline that is still ahead; return its time, s.
 
-        `meanwhile` is called before with that time, and should come back by then.
+        `meanwhile` is called first with that time, and should return by then.
         """
         self._count += 1
         due = self._first + self._count * self._period

@@ -1,4 +1,4 @@
-"""The history of one flight: its phases, preflight table, lateness and deviations, of which the outcome is made."""
+"""The history of one flight: its phases, preflight table, lateness and deviations, from which the outcome is made."""
 
 import math
 from collections.abc import Callable
@@ -20,12 +20,12 @@ class FlightHistory:
         self.report, self._now = report, clock.now
         self.phases: list[tuple[Phase, float]] = []  # each with the time, s, at which it was entered
         self.checks: tuple[Check, ...] = ()  # the preflight table
-        self.late: list[float] = []  # s by which the plan's setpoints were late
+        self.late: list[float] = []  # s, lateness of the plan's setpoints
         self.skipped = 0  # deadlines of the plan that passed without a setpoint
         self.off_plan: list[tuple[float, float]] = []
         """(s from the first setpoint, m) of each pose while the plan is flown and in the hover behind it."""
         self.first_setpoint = 0.0  # s, when the plan's first setpoint was due; 0 before
-        self.stopped_at = 0.0  # s, when the plan was left for a stop; 0 where it was not
+        self.stopped_at = 0.0  # s, when the plan was left for a stop; 0 if it was not
         self.rung = Rung.NONE  # how far down the abort ladder it went
         self.hint = ""  # what to do about the reason that ended the flight
 
@@ -40,7 +40,7 @@ class FlightHistory:
         self.report(Event(self._now(), level, text))
 
     def outcome(self, ends: float, exit_code: ExitCode, reason: str, last_pose: Pose | None) -> FlightOutcome:
-        """Return how the flight went, the motion of which ended `ends` s after its first setpoint."""
+        """Return the outcome of the flight, whose motion ended `ends` s after its first setpoint."""
         start = self.first_setpoint
         return FlightOutcome(
             exit_code=exit_code,

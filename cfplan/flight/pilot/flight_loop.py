@@ -41,10 +41,10 @@ from cfplan.vehicle.rotations import yaw_of
 
 ATTEMPTS = 3
 _KEEP_ALIVE_PERIOD = 0.1  # s; the vehicle's watchdog stops the motors after 1 s without a keep-alive packet
-MOTOR_TEST_PERIOD = 0.1  # s between two questions whether a motor test is on
+MOTOR_TEST_PERIOD = 0.1  # s between queries for a motor test
 LINK_LOST_AFTER = 10.0  # s without an acknowledgement, in flight; until then the link may come back
-_BRAKING_TIME = 0.2  # s of its speed, by which a vehicle that levels out stops beyond where it is
-_MAX_STREAMS = 8  # that are remembered: a pose that comes late is judged by the stream of its time
+_BRAKING_TIME = 0.2  # s; a vehicle that levels out stops its velocity times this ahead
+_MAX_STREAMS = 8  # streams to keep: a late pose is compared with the stream of its time
 
 
 class OrderSource(Protocol):
@@ -56,7 +56,7 @@ class OrderSource(Protocol):
 
 
 class AbortRaised(Exception):
-    """There is a reason to leave the plan."""
+    """Raised when there is a reason to leave the plan."""
 
     def __init__(self, abort: Abort):
         self.abort = abort
@@ -64,7 +64,7 @@ class AbortRaised(Exception):
 
 
 class LinkLost(Exception):
-    """Nothing more can be sent."""
+    """Raised when nothing more can be sent."""
 
 
 class FlightLoop:
@@ -93,23 +93,23 @@ class FlightLoop:
         self._link: Link | None = None
         self._feeding = False  # poses are read and forwarded
         self.airborne = False
-        self._took_off = False  # once True, a fault of this program lands the vehicle instead of being raised
-        self._stop_expected = math.inf  # s, from when on motors that do not turn were meant to stop
+        self._took_off = False  # from then on a fault of this program lands the vehicle instead of being raised
+        self._stop_expected = math.inf  # s, from when on standing motors are expected
         self._tolerated = Rung.NONE  # an abort of this rung or a lesser one changes nothing
         self.commitment = Commitment(0, mission.payloads, mission.stops)
         self.plan = stream_of(self.commitment, mission.rate, on_board=mission.on_board is not None)
         self.stream: Stream | None = None  # what each tick sends
         self._unheard = False
-        """The vehicle had no setpoint for so long that it left its stream by itself; until `hold_where_it_is`."""
+        """Whether the vehicle was without setpoints for so long that it left its stream; until `hold_where_it_is`."""
         self._sent_at = math.inf  # s, when the last setpoint was sent
         self._faults = set[str]()  # steps of a tick that have failed
-        self._just_sent = -1  # number of the last setpoint of the plan that was sent; -1 before the first
+        self._just_sent = -1  # number of the last setpoint sent of the plan; -1 before the first
         self._begun: deque[Stream] = deque(maxlen=_MAX_STREAMS)  # the last streams, each with its start
-        self.pose_fault = ""  # why no good pose comes
-        self._forwarded = math.inf  # s, the time of the last pose that was forwarded
-        self._kept_alive = -math.inf  # s, when the vehicle's watchdog was last sent a keep-alive packet
-        self._motor_test_polled = math.inf  # s, when the vehicle was last asked whether a motor test is on
-        self.waking: deque[float] = deque(maxlen=200)  # s by which the last ticks were late
+        self.pose_fault = ""  # why there is no good pose
+        self._forwarded = math.inf  # s, time of the last forwarded pose
+        self._kept_alive = -math.inf  # s, time of the last keep-alive packet
+        self._motor_test_polled = math.inf  # s, time of the last query for a motor test
+        self.waking: deque[float] = deque(maxlen=200)  # s, lateness of the last ticks
 
     # Connecting, and what the loop serves.
 
@@ -139,7 +139,7 @@ class FlightLoop:
             self._source.close()
 
     def watch_motor_test(self) -> None:
-        """From now on a motor test that another client starts is ended, and ends the flight."""
+        """From now on, end a motor test that another client starts, and the flight with it."""
         self._motor_test_polled = -math.inf
 
     def lift_off(self) -> None:
@@ -151,7 +151,7 @@ class FlightLoop:
         self.airborne = False
 
     def expect_stop(self) -> None:
-        """From now on only orders count once the motors are seen to stand: they are meant to."""
+        """From now on, only orders count once the motors are off, as is expected."""
         self._stop_expected = self.now()
 
     def tolerate(self, rung: Rung) -> None:
@@ -163,8 +163,8 @@ class FlightLoop:
     def begin(self, stream: Stream) -> Stream:
         """Send this stream from the next deadline on; return it with its start.
 
-        One that is flown on board begins when the command that was just sent has arrived, and the commander next looks
-        for one, which is half a period later in the mean.
+        A stream that is flown on board begins when the command just sent has arrived and the commander polls for it,
+        half a period later on average.
         """
         arrived = self.now() + 0.5 * self.link.round_trip + 0.5 / stream.rate
         self.stream = stream.starting_at(arrived if stream.on_board else self._deadlines.upcoming)
@@ -178,12 +178,12 @@ class FlightLoop:
         self._proposals.begin(self.plan.start)
 
     def end_stream(self) -> None:
-        """Send no setpoints any more."""
+        """Stop sending setpoints."""
         self.stream = None
 
     @property
     def finishing(self) -> bool:
-        """Return whether the vehicle is to land where its plan ends, without waiting for another."""
+        """Return whether the vehicle is to land at the end of its plan, without waiting for another."""
         return self._orders.finishing
 
     @property
@@ -192,16 +192,16 @@ class FlightLoop:
         return self.commitment.motion_ends / self.mission.rate
 
     def _consider_meanwhile(self, due: float) -> None:
-        """Look at proposals that come well before the next setpoint of the plan is `due`, s."""
+        """Consider proposals that arrive well before the next setpoint of the plan is `due`, s."""
         while self.stream is self.plan and (left := due - LOOKS_UNTIL - self.now()) > 0.0:
             if not self._proposals.wait(left):
                 return
             self._consider_proposal(self.now(), self._just_sent)
 
     def _consider_proposal(self, now: float, sent: int) -> None:
-        """Fly what a planner proposes from its splice on if it verifies; answer the planner.
+        """Fly a planner's proposal from its splice on if it verifies; answer the planner.
 
-        `sent` is the number of the setpoint that was sent last.
+        `sent` is the number of the last setpoint sent.
         """
         proposal = self._proposals.newest()
         if proposal is None:
@@ -220,19 +220,19 @@ class FlightLoop:
         self._proposals.answer(proposal, answer)
 
     def setpoint_position(self, time: float) -> Triple | None:
-        """Return where the vehicle was asked to be, m, at a time, s; None before the streams that are remembered."""
+        """Return the position, m, of the setpoint at a time, s; None before the streams that are kept."""
         moment = time - self.mission.lead
         if self.stream is None:
             return None
         return next((stream.position(moment) for stream in reversed(self._begun) if stream.start <= moment), None)
 
     def setpoint_now(self) -> tuple[Triple, Triple, float]:
-        """Return position, m, velocity, m/s, and yaw, rad, that the vehicle is asked for now, by its stream."""
+        """Return position, m, velocity, m/s, and yaw, rad, of the present setpoint."""
         assert self.stream is not None
         position, velocity, _, quaternion, _ = self.stream.state(self.stream.index(self.now()))
         return position, velocity, yaw_of(quaternion)
 
-    # A vehicle that was left alone: its radio was dead, or this computer stood still.
+    # A vehicle that was without setpoints: its radio was dead, or this computer stalled.
 
     @property
     def descent(self) -> Descent:
@@ -240,9 +240,9 @@ class FlightLoop:
         return Descent.HELD if self._unheard else self.health.reaction.descent
 
     def hold_where_it_is(self) -> None:
-        """Send a hover near where the vehicle is; once the vehicle acknowledges, it is no longer left alone.
+        """Send a hover near the vehicle's position, which it follows once it acknowledges.
 
-        The place is that of the poses, without them that of the vehicle's estimate, or else where it was seen last.
+        The position is that of fresh poses, else that of the vehicle's estimate, else that of the last pose.
         """
         estimate, space = self.link.estimate, self.limits.space
         position, velocity, yaw = self.tracked_state()
@@ -265,7 +265,7 @@ class FlightLoop:
         due = self._deadlines.wait(lambda due: self._guard("proposals", lambda: self._consider_meanwhile(due)))
         now = self.now()
         self.waking.append(now - due)
-        late = max(now - due, now - self._sent_at - 1.0 / self.mission.rate)  # wherever this computer stood still
+        late = max(now - due, now - self._sent_at - 1.0 / self.mission.rate)  # wherever this computer stalled
         self._guard("setpoints", lambda: self._send_setpoint(now, due))
         self._guard("watchdog", lambda: self._keep_alive(now))
         self._guard("motor test", lambda: self._end_motor_test(now))
@@ -304,7 +304,7 @@ class FlightLoop:
             self.history.late.append(now - due)
 
     def _keep_alive(self, now: float) -> None:
-        watched = self.airborne or self.watched  # to the end of the link: it locks 1 s later
+        watched = self.airborne or self.watched  # until the link closes; the vehicle locks 1 s later
         if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
@@ -324,7 +324,7 @@ class FlightLoop:
             self._consider_proposal(now, self._just_sent)
 
     def _update_health(self, now: float) -> None:
-        """Compute the health of this tick, and create anew the logs that the vehicle no longer sends."""
+        """Compute the health of this tick, and recreate logs that the vehicle no longer sends."""
         link = self.link
         self.health = self._health_monitor.look(
             now,
@@ -341,7 +341,7 @@ class FlightLoop:
                     link.recreate_log(log)
 
     def _take_poses(self) -> None:
-        """Forward the poses that have come. After take-off, a fault here counts as no pose: the last one grows old."""
+        """Forward new poses. After take-off, a fault here counts as no pose: the last one grows old."""
         if not self._feeding:
             return
         try:
@@ -422,7 +422,7 @@ class FlightLoop:
             raise AbortRaised(abort)
 
     def _stopped(self) -> bool:
-        """Return whether the motors stand, as they are meant to."""
+        """Return whether the motors are off, as expected."""
         status = self.link.status
         return status is not None and status.time > self._stop_expected and not any(status.motor)
 
@@ -445,12 +445,12 @@ class FlightLoop:
     # Waiting.
 
     def restart_deadlines(self) -> None:
-        """Count deadlines from now on; those that something slow on the ground has missed do not count."""
+        """Count deadlines from now on; those missed during slow work on the ground do not count."""
         self._deadlines = Deadlines(self.mission.rate, self._clock)
 
     @property
     def skipped(self) -> int:
-        """Return how many deadlines have passed altogether since `restart_deadlines`."""
+        """Return how many deadlines have been skipped since `restart_deadlines`."""
         return self._deadlines.skipped
 
     def until(self, done: Callable[[], bool], patience: float) -> bool:
@@ -485,12 +485,12 @@ class FlightLoop:
         return self.tracker.position(self.now()), self.tracker.velocity, yaw_of(self.pose().quaternion)
 
     def heights(self, duration: float) -> list[float]:
-        """Return the heights, m, of the good poses of the last `duration`, s; none if they do not reach back as far."""
+        """Return the heights, m, of the good poses of the last `duration`, s; none if they reach back less."""
         return self.tracker.heights(self.now() - duration)
 
     @property
     def time_without_poses(self) -> float:
-        """Return how long, s, the vehicle has been without a pose: late ones are not forwarded."""
+        """Return how long, s, the vehicle has been without a pose; late ones are not forwarded."""
         return self.now() - self._forwarded
 
     def bits(self, mask: int) -> int:

@@ -22,8 +22,8 @@ from cfplan.safety.limits import PoseLimits
 
 UPLINK_LATE = 0.25  # s without an answer to pings, ten a second
 UPLINK_GONE = Timeouts().level_out  # s; a vehicle without a setpoint for this long leaves its stream
-LOG_GONE = 0.6  # s without a message of one of the vehicle's logs; of a dead radio the uplink is gone before them
-_LONGEST_STEP = 0.05  # s of silence counted between two ticks at most; beyond it this computer stalled
+LOG_GONE = 0.6  # s without a message of one of the vehicle's logs; if the radio is dead, the uplink is gone first
+_LONGEST_STEP = 0.05  # s, longest silence counted between two ticks; beyond it this computer stalled
 
 
 class Freshness(StrEnum):
@@ -69,7 +69,7 @@ class Descent(Enum):
 class Reaction:
     """The pilot's reaction to the health of one tick."""
 
-    rung: Rung  # rung of the abort ladder to take at least, from take-off to the hover after the plan
+    rung: Rung  # least rung of the abort ladder, from take-off to the hover after the plan
     descent: Descent  # how the vehicle comes down then; also during a landing
 
 
@@ -110,7 +110,7 @@ class HealthMonitor:
 
     @property
     def uplink_silent(self) -> float:
-        """Return how long, s, nothing has been acknowledged."""
+        """Return how long, s, the vehicle has acknowledged nothing."""
         return self._silent[0]
 
     def look(self, now: float, *, uplink: float, estimate: float, status: float, poses: float) -> Health:

@@ -1,8 +1,8 @@
 """The hover check: thrust scale and battery, measured in the hover after take-off, against what was certified.
 
-In hover the motors carry the weight. What they are commanded, from the logged PWM and battery voltage by the firmware's
-motor curve, therefore shows the thrust scale at the mass that the airframe states. A climb that has not ended counts by
-the change of the estimated velocity. Masses and thrusts in proportion hover alike, so a wrong mass shows here as well.
+In hover the motors carry the weight, so their commanded thrust, from logged PWM and battery voltage by the firmware's
+motor curve, gives the thrust scale at the stated mass. A residual climb is corrected for by the change of the estimated
+velocity. Only thrust over mass is observable, so a wrong mass shows here as well.
 """
 
 import math
@@ -24,7 +24,7 @@ _FEWEST = 20  # reports of the motors; the log has fifty a second
 
 @dataclass(frozen=True, slots=True)
 class HoverMeasurement:
-    """What a hover shows of the vehicle."""
+    """Measurements of a vehicle in hover."""
 
     thrust_scale: float  # of the airframe as stated: actual over commanded thrust
     battery_voltage: float  # V, under the load of hovering
@@ -34,7 +34,7 @@ class HoverMeasurement:
 def measure_hover(
     statuses: list[VehicleStatus], estimates: tuple[Estimate, Estimate], airframe: Airframe
 ) -> HoverMeasurement:
-    """Return what a hover shows; `estimates` are from its beginning and its end. NaN where the log holds no numbers."""
+    """Return what a hover shows; `estimates` are from its beginning and its end. NaN if the log has no values."""
     before, after = estimates
     voltage = np.array([status.battery_voltage for status in statuses])
     shares = command_shares(np.array([status.motor for status in statuses], dtype=float), voltage, airframe)

@@ -1,4 +1,4 @@
-"""The operator's orders, by keys of the terminal and by signals."""
+"""The operator's orders: keys typed in the terminal, and signals."""
 
 import contextlib
 import os
@@ -17,15 +17,15 @@ from typing import Any
 
 from cfplan.flight.clock import REAL_CLOCK
 
-_ESCAPE_WAIT = 0.03  # s within which the rest of an arrow key follows its Esc
-_LONGEST_BURST = 1 << 16  # bytes that are read in one go
+_ESCAPE_WAIT = 0.03  # s to wait for the rest of an arrow key after its Esc
+_LONGEST_BURST = 1 << 16  # bytes per read
 _ARROWS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}  # by the letter that ends the sequence
 _KEY = re.compile(  # an arrow or function key as terminals send it, else a single byte
     rb"\x1b(?:(?:\[[0-9;]*|O)(?P<arrow>[A-D])|\[\[[A-E]|\[[0-?]*[!-/]*[@-Z\\-~]|O[0-9;]*[A-Za-z])|(?P<byte>.)",
     re.DOTALL,
 )
 _PARTIAL_KEY = re.compile(rb"\x1b(?:\[\[|\[[0-?]*[!-/]*|O[0-9;]*)?\Z")  # an incomplete arrow or function key
-_MAX_TYPED = 1000  # keys that are kept until somebody asks for them
+_MAX_TYPED = 1000  # keys kept for typed()
 
 
 class Order(IntEnum):
@@ -41,14 +41,14 @@ _ORDERS = {b" ": Order.LAND, b"\x1b": Order.CUT}
 
 @dataclass
 class HeldOrders:
-    """What the pilot knows of the operator and of the main process; an OrderSource."""
+    """The state of the operator's orders and of the main process; an OrderSource."""
 
     worst: Order | None = None  # the gravest order so far that ends the flight early
     finishing: bool = False  # the vehicle is to land where its plan ends
     gone: bool = False  # the main process has ended
 
     def give(self, order: Order) -> None:
-        """Take an order; a lesser one than before changes nothing."""
+        """Take an order; one that is less grave than an earlier one changes nothing."""
         if order is Order.FINISH:
             self.finishing = True
         else:
@@ -65,7 +65,7 @@ def orders_of(keys: bytes) -> list[Order]:
 
 
 def keys_of(keys: bytes) -> list[str]:
-    """Return the keys of a burst that are no orders: up, down, left, right, and printable characters but for space."""
+    """Return the keys of a burst that are not orders: up, down, left, right, and printable characters except space."""
     names = []
     for key in _KEY.finditer(keys):
         if key["arrow"]:
@@ -76,20 +76,20 @@ def keys_of(keys: bytes) -> list[str]:
 
 
 class Keyboard:
-    """Collects orders while it is entered. Without a terminal only signals give any.
+    """Collects orders while it is entered; without a terminal, from signals only.
 
     Keys are read from the terminal that started the program where standard input is a pipe or a file.
     Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM and SIGHUP land.
     Ctrl-Z and Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of output. If the
-    terminal closes, that lands too, and what is still printed to it is dropped.
+    terminal closes, the vehicle lands too, and further output is dropped.
     """
 
     def __init__(self, *, keys: bool = True) -> None:
-        """Take `keys` too, or leave what is typed to another reader; signals count either way."""
+        """Read `keys` too, or leave them to another reader; signals count either way."""
         self._keys = keys
         self._orders: deque[Order] = deque()
         self._typed: deque[str] = deque(maxlen=_MAX_TYPED)
-        self._opened: int | None = None  # the program's own terminal, where standard input is another
+        self._opened: int | None = None  # the program's own terminal, if standard input is something else
         self._interrupts = 0
         self._terminal: tuple[int, list[Any]] | None = None
         self._handlers: dict[int, Any] = {}
@@ -98,7 +98,7 @@ class Keyboard:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 self._handlers[number] = signal.signal(number, self._on_signal)
-        # No terminal, or not in its foreground: signals alone.
+        # No terminal, or not in its foreground: signals only.
         with contextlib.suppress(termios.error, OSError, ValueError, AttributeError):
             descriptor = sys.stdin.fileno()
             if self._keys and not os.isatty(descriptor):
@@ -115,7 +115,7 @@ class Keyboard:
         mode[3] &= ~(termios.ICANON | termios.ECHO)
         mode[6][termios.VMIN], mode[6][termios.VTIME] = 0, 0
         mode[6][termios.VSUSP] = b"\x00"
-        termios.tcsetattr(descriptor, termios.TCSANOW, mode)  # which lets output go on that Ctrl-S has stopped
+        termios.tcsetattr(descriptor, termios.TCSANOW, mode)  # resumes output that Ctrl-S has stopped
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -156,7 +156,7 @@ class Keyboard:
         return given
 
     def typed(self) -> list[str]:
-        """Return the keys since the last call that were no orders, as orders() has read them; from any thread."""
+        """Return the keys that orders() has read since the last call and that were not orders; from any thread."""
         keys = []
         while self._typed:
             keys.append(self._typed.popleft())
@@ -182,7 +182,7 @@ def _burst(terminal: int) -> bytes:
 
 
 def _drop_output() -> None:
-    """Let output to a closed terminal go nowhere: an error of it would end what is still to be done."""
+    """Discard output to a closed terminal, which would otherwise raise and interrupt the landing."""
     nowhere = os.open(os.devnull, os.O_RDWR)
     for stream in (0, 1, 2):
         with contextlib.suppress(OSError):

@@ -1,13 +1,14 @@
 """The landing: down by setpoints, and motors off once the vehicle stands.
 
-The vehicle is never given to its on-board commander, which has no time-out: while setpoints fly it, a vehicle whose
-pilot or radio dies levels out after 0.5 s and stops its motors after a second, at any height.
+The vehicle is never handed to its on-board commander, which has no time-out: a vehicle flown by setpoints whose pilot
+or radio dies levels out after 0.5 s and stops its motors after a second, at any height.
 
-The setpoints sink on beneath the floor. A vehicle that no longer follows them stands, be it on a box or lower than
-where it took off, and its motors are stopped. Without poses only its own estimate is left, whose height goes wrong with
-the square of time; so it comes down as fast as it may touch the floor. Its estimate still feels the floor. When neither
-that nor a pose has come in time, the motors stop wherever the vehicle is: it falls, but does not fly away. Where poses
-stop once its setpoint is on the floor, the motors stop at once: by an estimate gone wrong it would fly off from there.
+The setpoints continue below the floor. A vehicle that no longer follows them is standing, perhaps on a box or lower
+than its take-off position, and its motors are stopped. Without poses only its own estimate is left, whose height error
+grows with the square of time; so the vehicle descends as fast as it may touch the floor. Its estimate still shows the
+touchdown. If neither that nor a pose arrives in time, the motors stop wherever the vehicle is: it falls, but does not
+fly away. If poses stop when its setpoint is already on the floor, the motors stop at once, as with a wrong estimate the
+vehicle would fly off.
 """
 
 import math
@@ -23,36 +24,38 @@ from cfplan.flight.radio.supervisor_bits import FLYING
 from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, off_walls, sinking
 from cfplan.flight.telemetry import Level, Phase, Triple
 
-_DEPTH_BELOW_FLOOR = 0.3  # m below where it took off, and below the space, that setpoints sink to
-_NEAR_FLOOR = 0.15  # m above where it took off
-_STANDING_GAP = 0.05  # m that a standing vehicle is above its setpoint, near the floor
-_NO_THRUST_GAP = 0.25  # m above its setpoint, where the controller asks for no thrust: what does not fall, stands
+_DEPTH_BELOW_FLOOR = 0.3  # m below the take-off position and below the space, where setpoints end
+_NEAR_FLOOR = 0.15  # m above the take-off position
+_STANDING_GAP = 0.05  # m above its setpoint, from which a vehicle near the floor counts as standing
+_NO_THRUST_GAP = (
+    0.25  # m above its setpoint: the controller commands no thrust, so a vehicle that does not fall is standing
+)
 _AT_REST_FOR, _AT_REST_WITHIN = (
     0.08,
     0.02,
-)  # s and m: poses so near to where it took off from show that it is on the floor
+)  # s and m: poses this near to the take-off position show that it is on the floor
 _STANDS_FOR = 0.3  # s
-_STANDS_WITHIN = 0.015  # m, the range of the heights of a standing body's poses
+_STANDS_WITHIN = 0.015  # m, range of the heights of a standing body's poses
 _SETTLE_TIME = 0.3  # s at the end of a descent before the motors stop
-_BLIND_DEPTH_BELOW_FLOOR = 2.0  # m below the floor that setpoints sink to without poses, so that their time ends first
-MAX_BLIND_LANDING = 3.0  # s without poses after which the motors stop, as the estimate may be metres off
-_MIN_SINKING_HEIGHT = 0.4  # m above the floor, below which a vehicle that still brakes does not sink
-POSES_TRUSTED_AFTER = 0.2  # s of fresh poses, so several of them, after which they are trusted again
+_BLIND_DEPTH_BELOW_FLOOR = 2.0  # m below the floor, where setpoints end without poses, later than MAX_BLIND_LANDING
+MAX_BLIND_LANDING = 3.0  # s without poses until the motors stop, as the estimate may be wrong by metres
+_MIN_SINKING_HEIGHT = 0.4  # m above the floor, below which a braking vehicle does not sink
+POSES_TRUSTED_AFTER = 0.2  # s of fresh poses until they are trusted again
 MOTORS_STOP_TIMEOUT = 2.5  # s; the vehicle reports that it no longer flies 2 s after its motors stopped
 _RETRY_PERIOD = 0.05  # s
-_ESTIMATE_DEPTH = 0.3  # m below the floor: an estimate that has the vehicle there is worth nothing
-_IDLE_FOR = 0.2  # s without any thrust, which no descent asks for
+_ESTIMATE_DEPTH = 0.3  # m below the floor, where the estimate must be wrong
+_IDLE_FOR = 0.2  # s without thrust; no descent commands that
 
 
 class Landing:
-    """Lands once. Where an abort interrupts it, the next call of `land` goes on."""
+    """Lands once. If an abort interrupts it, the next call of `land` continues."""
 
     def __init__(self, loop: FlightLoop, floor: float):
         self._loop, self._floor = loop, floor  # m, height of the tracked body on the floor
         self.begun = False
         self._stands = False
-        self._was_blind = False  # the setpoints may be far from where the vehicle is
-        self._idle_since = math.inf  # s, since when the controller lets all motors stand
+        self._was_blind = False  # setpoints may be far from the vehicle
+        self._idle_since = math.inf  # s, since when the controller has commanded no thrust
 
     def begin(self) -> None:
         """Enter the phase, once."""
@@ -61,7 +64,7 @@ class Landing:
             self._loop.history.enter(Phase.LAND)
 
     def sink_while_stopping(self) -> None:
-        """Begin while the vehicle still brakes: let what is left of that stop sink besides, off the walls."""
+        """Begin while the vehicle still brakes: let the rest of the stop also sink and move away from the walls."""
         self.begin()
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
@@ -70,7 +73,7 @@ class Landing:
             loop.begin(Stream(sinks, stream.rate))
 
     def land(self) -> None:
-        """Descend from where the vehicle is asked to be, and stop its motors. Raises AbortRaised if they do not."""
+        """Descend from the present setpoint, and stop the motors. Raises AbortRaised if they do not stop."""
         self.begin()
         self._stands |= self._loop.stream is None  # its motors are already being stopped, on the floor
         while not self._stands:
@@ -88,7 +91,7 @@ class Landing:
         self._loop.touch_down()
 
     def _descend(self) -> None:
-        """Sink until the vehicle stands, or poses are gone; from the pose if those have only come back."""
+        """Sink until the vehicle stands or poses are gone; from the last pose if they have just returned."""
         loop = self._loop
         lowest = min(self._floor, loop.limits.space.low[2]) - _DEPTH_BELOW_FLOOR
         pace = gentle(loop.limits.ground.land_speed)
@@ -106,7 +109,7 @@ class Landing:
             self._conclude(stands())
 
     def _descend_blindly(self) -> None:
-        """Sink quickly, off the walls, until the estimate or the time says that it is enough, or poses are back."""
+        """Sink quickly and away from the walls, until the estimate shows touchdown, time is up, or poses are back."""
         loop = self._loop
         begin = loop.setpoint_now()
         self._sink(begin, QUICK, self._floor - _BLIND_DEPTH_BELOW_FLOOR, off_walls(begin[0], loop.limits.space))
@@ -146,7 +149,7 @@ class Landing:
     def _at_take_off_place(self) -> bool:
         """Return whether poses show the vehicle on the floor, far below its setpoint: it fell there.
 
-        It believes a motion that the floor has ended, and would fly off by that as its setpoint lifts it again.
+        Its estimate still contains the fall, so it would fly off when a setpoint lifts it again.
         """
         heights = self._loop.heights(_AT_REST_FOR)
         on_floor = bool(heights) and max(heights) - self._floor < _AT_REST_WITHIN
@@ -157,7 +160,7 @@ class Landing:
         return stream is None or self._loop.now() > stream.end + _SETTLE_TIME
 
     def _blind_on_floor(self) -> bool:
-        """Return whether no good poses come of a vehicle whose setpoint, led by those before, is on the floor."""
+        """Return whether good poses are missing while the setpoint, reached with poses, is on the floor."""
         loop = self._loop
         if loop.stream is None or self._was_blind or loop.descent is Descent.HELD:
             return False
@@ -169,17 +172,17 @@ class Landing:
             self._loop.history.add_event(Level.WARNING, "touchdown is not confirmed; the motors are stopped")
 
     def _beneath_by_estimate(self) -> bool:
-        """Return whether the vehicle believes itself far beneath the floor, and would climb from there.
+        """Return whether the vehicle's estimate is far below the floor, from where it would climb.
 
-        It stands then, after a fall that its sensors did not follow, or is as low as its estimate was wrong.
+        It stands then, after a fall that its sensors did not follow, or is low.
         """
         estimate = self._loop.estimate
         return estimate is not None and estimate.position[2] < self._floor - _ESTIMATE_DEPTH
 
     def _stands_by_estimate(self) -> bool:
-        """Return whether the estimate is so far above its setpoint, or the motors are off for so long, that it stands.
+        """Return whether the vehicle stands, as its estimate is far above its setpoint, or its motors have been off.
 
-        A vehicle that touches the floor leaning believes anything afterwards, but its controller gives up.
+        After a touchdown at a tilt the estimate may be anything, but the controller then commands no thrust.
         """
         loop, estimate, status = self._loop, self._loop.estimate, self._loop.status
         if status is not None:
@@ -195,7 +198,7 @@ class Landing:
 def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) -> bool:
     """Return whether the tracked body stays where it is although its setpoint has sunk on.
 
-    Near the `floor`, m, a little above its setpoint is enough; elsewhere it is to be `not_held`, m, above it.
+    It must be `not_held`, m, above its setpoint; near the `floor`, m, less is enough.
     """
     pose = loop.pose()
     setpoint_position, heights = loop.setpoint_position(pose.time), loop.heights(_STANDS_FOR)
@@ -207,9 +210,9 @@ def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) 
 
 
 def stop_motors(loop: FlightLoop) -> bool:
-    """Stop the motors by stop setpoints, the last setpoints to be sent; return whether the vehicle says so.
+    """Stop the motors by stop setpoints, the last setpoints sent; return whether the vehicle confirms it.
 
-    Then the vehicle's own null setpoints must count again: if none came, its supervisor would lock.
+    Afterwards the vehicle's own null setpoints must take over, or its supervisor would lock.
     """
 
     def send() -> None:

@@ -1,4 +1,4 @@
-"""Manoeuvres: the phases in the air as a pilot asks for them, and what all ways to fly them share."""
+"""Manoeuvres: the phases in the air, and what streamed and on-board flight have in common."""
 
 import math
 from collections.abc import Callable
@@ -19,7 +19,7 @@ Place = tuple[float, float, float, float]  # m, m, m, and yaw, rad
 _AT_PLACE_WITHIN = 0.06  # m
 _AT_START_FOR = 0.5  # s
 READY_TIMEOUT = 1.0  # s; a vehicle that arms itself is briefly not ready now and then
-# m above the floor: when the setpoint has reached the first, the pose must have reached the second
+# m above the floor: once the setpoint is at the first height, the pose must be at the second
 _SETPOINT_RISE, _POSE_RISE = 0.12, 0.015
 
 
@@ -27,7 +27,7 @@ class Manoeuvres(Protocol):
     """The phases of a flight in the air. Each may raise AbortRaised and LinkLost."""
 
     def take_off(self) -> None:
-        """Climb to a hover. Raises PreflightError where the vehicle stays on the floor."""
+        """Climb to a hover. Raises PreflightError if the vehicle stays on the floor."""
 
     def go_to_start(self) -> None:
         """Fly to where the plan begins."""
@@ -46,9 +46,9 @@ class Manoeuvres(Protocol):
 
 
 def _require_ready(loop: FlightLoop) -> None:
-    """Wait until the vehicle's supervisor says that it may fly: it ignores setpoints until then.
+    """Wait until the vehicle's supervisor reports that it can fly; it ignores setpoints until then.
 
-    Raises PreflightError if it does not say so.
+    Raises PreflightError if it does not.
     """
     if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, READY_TIMEOUT):
         return
@@ -66,9 +66,9 @@ def _require_ready(loop: FlightLoop) -> None:
 def begin_take_off(
     loop: FlightLoop, floor: float, way_between: Callable[[Place, Place, float], Stream]
 ) -> tuple[Stream, float]:
-    """Let the vehicle fly from now on; return the way straight up from the `floor`, m, to a hover, and its time, s.
+    """Begin to fly; return setpoints straight up from the `floor`, m, to a hover, and their duration, s.
 
-    `way_between` two places makes setpoints. Raises PreflightError where the vehicle may not fly.
+    `way_between` makes setpoints between two places. Raises PreflightError if the vehicle cannot fly.
     """
     loop.await_clearance(Phase.TAKE_OFF)
     loop.history.enter(Phase.TAKE_OFF)
@@ -77,7 +77,7 @@ def begin_take_off(
     duration = manoeuvre_time(height - floor, loop.limits.ground.take_off_speed)
     way = way_between((x, y, floor, yaw), (x, y, height, yaw), duration)
     if way.stop_from is not None:
-        way.stop_from(0)  # the first call is slow: make it on the ground
+        way.stop_from(0)  # the first call is slow, so make it on the ground
     _require_ready(loop)
     loop.lift_off()
     return way, duration
@@ -86,8 +86,8 @@ def begin_take_off(
 def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Callable[[], object]) -> None:
     """Wait until the vehicle has climbed along `way` from the `floor` to a `height`, m; `stop` stops its motors.
 
-    Raises PreflightError where it stays on the floor, and AbortRaised where it hardly rises or where its hover shows
-    another thrust than was certified.
+    Raises PreflightError if it stays on the floor, and AbortRaised if it hardly rises or if its hover shows a thrust
+    other than was certified.
     """
 
     def stays() -> bool:
@@ -104,8 +104,8 @@ def climb(loop: FlightLoop, way: Stream, floor: float, height: float, stop: Call
 def _pose_stays(loop: FlightLoop, way: Stream, floor: float) -> bool:
     """Return whether the tracked body stays on the floor while the vehicle must rise.
 
-    On the ground the vehicle cannot be told from another body that stands still. With that body's pose the
-    vehicle's controller would climb at full thrust.
+    On the ground the vehicle cannot be distinguished from another body that stands still. With the pose of that body
+    the vehicle's controller would climb at full thrust.
     """
     pose = loop.pose()
     asked = way.position(pose.time - loop.mission.lead)[2]
@@ -131,7 +131,7 @@ def _stay_down(loop: FlightLoop, stop: Callable[[], object]) -> None:
 
 
 def settle_at(loop: FlightLoop, start: Triple) -> None:
-    """Wait until the vehicle rests at the start, m. Raises AbortRaised where it does not come there."""
+    """Wait until the vehicle rests at the start, m. Raises AbortRaised if it does not arrive."""
     near_since = math.inf
 
     def settled() -> bool:

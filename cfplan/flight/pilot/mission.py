@@ -21,13 +21,13 @@ class Mission:
     """One certified flight, encoded."""
 
     payloads: NDArray  # (N, 29) uint8, the setpoints from rest to rest
-    stops: NDArray  # (N, M, 29) uint8, a way to stop from each setpoint, as stops.encode_stops makes them
+    stops: NDArray  # (N, M, 29) uint8, a stop from each setpoint, see stops.encode_stops
     limits: Limits
-    lead: float = 0.0  # s by which each setpoint is ahead of the trajectory at its time
+    lead: float = 0.0  # s by which setpoints lead the trajectory
     hold_time: float = 1.0  # s that the vehicle hovers after the last setpoint before it is handed back
     rate: float = RATE  # Hz
     on_board: OnBoardProgram | None = None
-    """Where the vehicle's own commander is to fly: then setpoints and stops are what it flies, and are not sent."""
+    """The vehicle's own commander flies this; setpoints and stops then describe its motion and are not sent."""
 
     @property
     def start(self) -> tuple[Triple, float]:

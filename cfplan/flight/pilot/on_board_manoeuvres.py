@@ -1,9 +1,9 @@
-"""Manoeuvres on board: the vehicle's own commander flies, and the pilot asks, watches, and ends the flight.
+"""On-board manoeuvres: the vehicle's own commander flies, and the pilot commands, watches, and ends the flight.
 
-The commander flies take-off, the way to the start, the uploaded trajectory with the landing at its end, and where the
-abort ladder asks for it, a stop from any state and a landing. Nothing is streamed but poses and keep-alive packets. The
-vehicle has no time-out for what its commander flies; its watchdog alone, which stops its motors a second after the last
-keep-alive packet, and runs before they turn.
+The commander flies the take-off, the way to the start, and the uploaded trajectory with the landing at its end; if the
+abort ladder requires it, also a stop from any state and a landing. Only poses and keep-alive packets are streamed. The
+commander has no time-out. The watchdog, which is started before the motors turn, stops them a second after the last
+keep-alive packet.
 """
 
 import math
@@ -32,13 +32,13 @@ from cfplan.flight.telemetry import Level, Phase
 from cfplan.vehicle.rotations import yaw_of
 
 ANSWER_TIMEOUT = 0.3  # s
-_KEEP_ALIVE_TIME = 0.4  # s before the motors turn: some packets, one of which starts the watchdog
-_QUICK_DESCENT = 1.5  # m/s², at most about, of a landing without poses, where the estimate goes wrong with time
+_KEEP_ALIVE_TIME = 0.4  # s of keep-alive packets before the motors turn; the first to arrive starts the watchdog
+_QUICK_DESCENT = 1.5  # m/s², about, of a landing without poses, as the estimate drifts
 _SHORTEST_LANDING = 1.2  # s
 _LANDING_DEPTH, _BLIND_LANDING_DEPTH = (
     0.05,
     0.5,
-)  # m beneath the floor that landings aim at; without poses the height is unsure
+)  # m below the floor, where landings end; more without poses, as the height is uncertain
 _SETTLE_TIME = 0.5  # s at the end of a descent
 
 
@@ -68,9 +68,9 @@ def _ask(
     sent: Callable[[], object] = lambda: None,
     taken: Callable[[], bool] = lambda: False,
 ) -> int | None:
-    """Send a command until it is answered, and return the answer; None where none comes.
+    """Send a command until it is answered, and return the answer; None if there is none.
 
-    `sent` is called at each sending. A command that was `taken`, as the vehicle's log shows, is not sent again.
+    `sent` is called at each sending. A command that was `taken` according to the vehicle's log is not sent again.
     """
     number = command[0]
     for attempt in range(ATTEMPTS):
@@ -79,7 +79,7 @@ def _ask(
         sent()
         loop.until(lambda: number in loop.link.replies, ANSWER_TIMEOUT)
         answer = loop.link.replies.get(number)
-        if taken() or (attempt and answer == commands.BUSY):  # the first one came, and its answer did not
+        if taken() or (attempt and answer == commands.BUSY):  # the first one arrived, its answer did not
             return commands.DONE
         if answer is not None:
             return answer
@@ -97,11 +97,11 @@ class OnBoardManoeuvres:
     def __init__(self, loop: FlightLoop, floor: float, program: OnBoardProgram):
         self._loop, self._floor, self._program = loop, floor, program  # m, height of the tracked body before take-off
         self._mission, self._limits, self._history = loop.mission, loop.limits, loop.history
-        self._stopping = False  # a stop was asked for
+        self._stopping = False  # a stop was commanded
         self._landing = False  # the last descent has begun
 
     def take_off(self) -> None:
-        """Climb to a hover, once the watchdog runs. Raises PreflightError where the vehicle stays on the floor."""
+        """Climb to a hover once the watchdog runs. Raises PreflightError if the vehicle stays on the floor."""
         loop, height = self._loop, self._mission.take_off_height
         way, duration = begin_take_off(loop, self._floor, self._way)
         loop.pause(_KEEP_ALIVE_TIME)
@@ -168,7 +168,7 @@ class OnBoardManoeuvres:
         self._descend()
 
     def _require(self, answer: int | None, what: str) -> None:
-        """Raise AbortRaised unless the vehicle does as it is asked."""
+        """Raise AbortRaised unless the vehicle accepted the command."""
         if answer != commands.DONE:
             raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.LAND, command=what, answer=_answer_text(answer)))
 
@@ -219,9 +219,9 @@ class OnBoardManoeuvres:
             self._history.enter(Phase.LAND)
 
     def _descend(self) -> None:
-        """Let the commander land from where it is asked to be; quickly without poses."""
+        """Let the commander land from the present setpoint; quickly without poses."""
         loop = self._loop
-        if loop.stream is None:  # it was not asked to take off yet
+        if loop.stream is None:  # no take-off was commanded yet
             self._end_landing()
             return
         (x, y, z), _, yaw = loop.setpoint_now()
@@ -252,5 +252,5 @@ class OnBoardManoeuvres:
         self._loop.touch_down()
 
     def _stop_motors(self) -> bool:
-        """Stop the motors, and return whether the vehicle says so; its null setpoints count from then on."""
+        """Stop the motors, and return whether the vehicle confirms it; its null setpoints take over then."""
         return stop_until_confirmed(self._loop, lambda: _ask(self._loop, commands.stop()))

@@ -17,7 +17,7 @@ class Rung(IntEnum):
     NONE = 0
     BRAKE = 1  # along the planned path to a hover, then land
     LAND = 2  # the same stop, then land at once, where it is
-    CUT = 3  # motors off, wherever it is
+    CUT = 3  # motors off at any height
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Deviation:
 
 
 def settle_time(samples: Sequence[tuple[float, float]], within: float) -> float:
-    """Return when, s after the end of the motion, the vehicle has come to stay `within` m; inf if it has not.
+    """Return when, s after the end of the motion, the vehicle settled `within` m; inf if it did not.
 
     `samples` are (s after the end of the motion, m), ascending.
     """
@@ -61,24 +61,24 @@ def settle_time(samples: Sequence[tuple[float, float]], within: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class FlightOutcome:
-    """What the pilot reports when the vehicle is down, or was never armed."""
+    """The pilot's report once the vehicle is down, or was never armed."""
 
     exit_code: ExitCode
     reason: str  # one line
     rung: Rung  # how far down the abort ladder it went
-    checks: tuple[Check, ...]  # the preflight table, as far as it came
+    checks: tuple[Check, ...]  # the preflight table, as far as it was run
     phases: tuple[tuple[Phase, float], ...]  # each phase entered, with its time on the clock of time.monotonic()
-    first_setpoint: float  # s on the same clock; 0 where none was sent
+    first_setpoint: float  # s on the same clock; 0 if none was sent
     flown: float  # s, from the first setpoint to the last that moved
     lateness: Lateness
     deviation: Deviation
-    settled_after: float  # s after the last moving setpoint; inf where it did not settle, or was not asked to
-    end_position: Triple  # m, where it was last seen
-    telemetry_dropped: int = 0  # messages that found the main process too slow
+    settled_after: float  # s after the last moving setpoint; inf if it did not settle, or the plan was left
+    end_position: Triple  # m, by the last pose
+    telemetry_dropped: int = 0  # messages dropped because the main process was too slow
     hint: str = ""  # what to do about the first reason
 
     def to_dict(self) -> dict[str, Any]:
-        """Return how it ended, for JSON; a record's summary measures the flight itself by its streams."""
+        """Return the outcome for JSON; a record's summary measures the flight from its streams."""
         return {
             "exit_code": int(self.exit_code),
             "reason": self.reason,
@@ -92,7 +92,7 @@ class FlightOutcome:
         }
 
     def check_rows(self) -> list[list[str]]:
-        """Return the preflight table: check, value, threshold, verdict, and a hint where it failed."""
+        """Return the preflight table: check, value, threshold, verdict, and a hint if it failed."""
         return [
             [check.name, check.value, check.threshold, "ok", ""]
             if check.passed

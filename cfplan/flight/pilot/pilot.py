@@ -1,7 +1,7 @@
 """The pilot: the phases of one flight in the air, and the abort ladder that ends it early.
 
-Each rung of the abort ladder can only be left for a graver one. How the vehicle is made to fly is for its manoeuvres
-to know: by setpoints, or by its on-board commander.
+Each rung of the abort ladder can only be left for a graver one. The manoeuvres know how the vehicle is flown: by
+setpoints, or by its on-board commander.
 """
 
 from collections.abc import Callable
@@ -49,7 +49,7 @@ class Pilot:
         self._connect, self._enter_real_time = connect, enter_real_time
         self._history = FlightHistory(report, clock)
         self._loop = FlightLoop(mission, source, orders, self._history, proposals, clock, conductor=conductor)
-        self._manoeuvres: Manoeuvres = StreamedManoeuvres(self._loop, floor=0.0)  # until that is known
+        self._manoeuvres: Manoeuvres = StreamedManoeuvres(self._loop, floor=0.0)  # replaced once the vehicle is armed
 
     def fly(self) -> FlightOutcome:
         """Fly all phases. Raises a CfplanError if the vehicle or its poses are not available; nothing is armed then."""
@@ -67,7 +67,7 @@ class Pilot:
         return self._history.outcome(loop.motion_ends + self._mission.lead, exit_code, reason, last_pose)
 
     def _fly(self) -> tuple[ExitCode, str]:
-        """Go through the phases; return how the flight counts, and why it ended."""
+        """Fly the phases in order; return the exit code, and why the flight ended."""
         loop = self._loop
         try:
             floor = prepare(loop, self._connect, self._enter_real_time)
@@ -81,7 +81,7 @@ class Pilot:
         except LinkLost:
             raise
         except Exception as error:
-            if loop.airborne:  # no error may end the flight in the air
+            if loop.airborne:  # an error must not end the program in the air
                 return self._leave_plan(fault_abort(error))
             if not isinstance(error, CfplanError) or not self._history.checks:
                 raise
@@ -91,9 +91,9 @@ class Pilot:
     # The abort ladder.
 
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
-        """Go down the ladder to the ground; return how the flight counts, and why."""
+        """Descend the abort ladder to the ground; return the exit code and the reason."""
         loop, flown = self._loop, self._manoeuvres
-        descents = [flown.land, flown.stop_and_land]  # the last one is flown; one that fails is removed
+        descents = [flown.land, flown.stop_and_land]  # the last one is tried; if it fails it is removed
         exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)
@@ -124,7 +124,7 @@ class Pilot:
             reasons.append(abort.text)
 
     def _cut(self) -> None:
-        """Cut the motors, at every tick until the vehicle reports that it is locked and they stand.
+        """Cut the motors at every tick until the vehicle reports that it is locked and they are off.
 
         The radio may lose packets, and a motor test turns the motors of a locked vehicle.
         """
@@ -163,7 +163,7 @@ class Pilot:
         self._history.enter(Phase.CLOSED)
 
     def _disarm(self) -> bool:
-        """Disarm the vehicle; return whether it says so. Where the radio is dead, wait for it: it may come back."""
+        """Disarm the vehicle; return whether it confirms. If the radio is dead, wait: it may come back."""
         loop, heard = self._loop, 0
         give_up = loop.now() + LINK_LOST_AFTER
         while heard < ATTEMPTS and loop.now() < give_up:
@@ -174,7 +174,7 @@ class Pilot:
         return False
 
     def _restart(self) -> None:
-        """Restart the vehicle, which its watchdog locks now that nothing feeds it, for the next flight."""
+        """Restart the vehicle for the next flight, as its watchdog locks it once keep-alive packets end."""
         self._history.add_event(Level.INFO, "the vehicle restarts for the next flight")
         try:
             self._loop.link.restart()

@@ -20,14 +20,14 @@ from cfplan.vehicle.rotations import yaw_of
 CONVERGED_WITHIN = 0.03  # m, estimate from pose
 CONVERGED_FOR = 1.0  # s
 _OBSERVATION_TIME = 1.0  # s
-LISTEN_WHILE_ARMED = 0.2  # s, some messages of each log
+LISTEN_WHILE_ARMED = 0.2  # s, several messages of each log
 _ALL = 0xFFFF  # bits of supervisor.info
 
 
 def prepare(
     loop: FlightLoop, connect: Callable[[Callable[[], None]], Link], enter_real_time: Callable[[], None] = lambda: None
 ) -> float:
-    """Go through all phases on the ground, to an armed vehicle; return the height, m, of its pose on the floor.
+    """Run all phases on the ground, until the vehicle is armed; return the height, m, of its pose on the floor.
 
     `enter_real_time` is called before anything is measured.
 
@@ -56,7 +56,7 @@ def prepare(
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
-    for _ in range(ATTEMPTS):  # a busy radio may give one up
+    for _ in range(ATTEMPTS):  # a busy radio may drop one
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):
             _listen_while_armed(loop)
@@ -66,7 +66,7 @@ def prepare(
 
 
 def _configure(loop: FlightLoop) -> dict[str, float]:
-    """Set what the table says, and return all of its parameters as the vehicle then has them."""
+    """Set the parameters of the table, and return all of them as read back."""
     link, limits = loop.link, loop.mission.limits
     for rule in PARAMETER_RULES:
         if link.has_parameter(rule.name):
@@ -89,7 +89,7 @@ def _feed(loop: FlightLoop) -> None:
 
 
 def _converge(loop: FlightLoop) -> Triple:
-    """Set the vehicle's filter to the pose of motion capture, and wait until both agree. Return the place, m."""
+    """Set the vehicle's filter to the pose of motion capture, and wait until both agree. Return its position, m."""
     loop.history.enter(Phase.CONVERGE)
     pose = loop.pose()
     for name, value in zip(("X", "Y", "Z"), pose.position, strict=True):
@@ -139,10 +139,10 @@ def _preflight(loop: FlightLoop, read: dict[str, float], stood: Triple) -> None:
 
 
 def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> PreflightSnapshot:
-    """Observe for a second and return what is known of the vehicle."""
+    """Observe the vehicle for a second and return the snapshot for preflight."""
     traffic = _listen(loop, _OBSERVATION_TIME)
     link = loop.link
-    assert link.estimate is not None  # the log has come since configuring
+    assert link.estimate is not None  # received since configuring
     assert link.status is not None
     return PreflightSnapshot(
         mission=loop.mission,
@@ -165,9 +165,9 @@ def _observe(loop: FlightLoop, read: dict[str, float], stood: Triple) -> Preflig
 
 
 def _listen(loop: FlightLoop, duration: float) -> Traffic:
-    """Return what is heard of other commanders in `duration`, s."""
+    """Return the signs of other commanders within `duration`, s."""
     bits, setpoint = 0, False
-    loop.link.replies.clear()  # an answer to an earlier connection may have come late
+    loop.link.replies.clear()  # a late answer to an earlier connection
 
     def look() -> bool:
         nonlocal bits, setpoint
@@ -179,7 +179,7 @@ def _listen(loop: FlightLoop, duration: float) -> Traffic:
 
 
 def _listen_while_armed(loop: FlightLoop) -> None:
-    """Listen once more: a vehicle that is not armed drops setpoints and shows none. Raises PreflightError."""
+    """Listen again, as a vehicle that is not armed drops setpoints and shows none. Raises PreflightError."""
     heard = check_traffic(_listen(loop, LISTEN_WHILE_ARMED))
     loop.link.stop_preflight_logs()
     _require(heard, "vehicle")

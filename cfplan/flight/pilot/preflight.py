@@ -26,41 +26,41 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES, inside
 from cfplan.vehicle.rotations import tilt_of, yaw_of
 
-OLDEST_PROTOCOL = 8  # the first with go-to as it is sent here
+OLDEST_PROTOCOL = 8  # the first with the go-to command that cfplan sends
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
-_WAY_STEP = 0.01  # m, between the places that are checked on the way to the start
+_WAY_STEP = 0.01  # m between the checked places on the way to the start
 LARGEST_HEIGHT = 0.3  # m, of the tracked body above the floor: the vehicle may stand on a box
-LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors lean by less
+LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors are flatter
 
 
 @dataclass(frozen=True, slots=True)
 class PreflightSnapshot:
-    """What is known of the vehicle before it is armed."""
+    """The state of the vehicle before it is armed."""
 
     mission: Mission
     protocol: int
-    firmware: str  # as the vehicle says it; empty where it does not
+    firmware: str  # as reported; empty if it is not
     round_trip: float  # s
     could_fly: bool
     """The supervisor reported at least once in the last second that it can fly or, as brushless vehicles do, that it
     waits to be armed."""
     status: VehicleStatus
     traffic: Traffic
-    parameters: Mapping[str, float]  # those of the table, as the vehicle has them; without those that it lacks
+    parameters: Mapping[str, float]  # those of the table that the vehicle has, as read back
     poses: Sequence[Pose]  # of about the last second, oldest first
     pose_age: float  # s, of the newest
-    stood: Triple  # m, where the vehicle stood when its filter was set to its pose
+    stood: Triple  # m, pose of the vehicle when its filter was set
     estimate: Estimate
     variance: Sequence[float]  # m², of position along x, y, z
     health: Health
     waking: Lateness  # how late this computer met its deadlines in the last second
     uses_fifo_scheduling: bool = False
-    """The stream has the processor ahead of ordinary programs, which the system must permit."""
+    """Whether the stream runs ahead of ordinary programs, which the system must permit."""
 
 
 def run_checks(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
-    """Every check, in the order of the table; parameters have a line a group, and one for each that is wrong."""
+    """All checks, in the order of the table; parameters have one line per group, and one for each that is wrong."""
     more = ON_BOARD_CHECKS if snapshot.mission.on_board is not None else ()
     return (*(check(snapshot) for check in (*CHECKS, *more)), *check_parameters(snapshot))
 
@@ -139,7 +139,7 @@ def check_timeouts(snapshot: PreflightSnapshot) -> Check:
 
 
 def timeouts_check(firmware: str) -> Check:
-    """Compare the supervisor's time-outs, which no vehicle tells, with those that link loss is certified with."""
+    """Compare the supervisor's time-outs, known by firmware version, with those assumed for link loss."""
     version, assumed = version_of(firmware), Timeouts()
     try:
         found = timeouts_of(version)
@@ -155,7 +155,7 @@ def timeouts_check(firmware: str) -> Check:
 
 
 def check_parameters(snapshot: PreflightSnapshot) -> tuple[Check, ...]:
-    """A line for each group of the table whose parameters are all right, and for each parameter that is wrong."""
+    """Return one line per group of parameters that are in order, and one for each parameter that is wrong."""
     found: list[Check] = []
     for group, rules in PARAMETER_GROUPS.items():
         checks = [check_rule(rule, snapshot.parameters.get(rule.name), snapshot.mission.limits) for rule in rules]
@@ -216,9 +216,9 @@ def check_standing(snapshot: PreflightSnapshot) -> Check:
 
 
 def standing_check(stood: Triple, seen: Triple, limits: Limits) -> Check:
-    """A body that is elsewhere now than where it stood, m, was not carried there: nobody is near an armed vehicle.
+    """Check that the standing body has not moved since its filter was set; nobody carries it now.
 
-    After a gap motion capture has taken something else for it, or shifted its frame: then all it says may be wrong.
+    After a gap, motion capture may have confused it with another body, or shifted its frame.
     """
     most, moved = limits.pose.agreement, math.dist(stood, seen)
     return Check(
@@ -247,7 +247,7 @@ def check_tilt(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_height(snapshot: PreflightSnapshot) -> Check:
-    """A body defined where it stands is level in any frame; its height shows whether z is up."""
+    """Check the height of the body: its tilt is zero in any frame, so only the height shows whether z is up."""
     height = snapshot.poses[-1].position[2] - snapshot.mission.limits.space.low[2]
     return Check(
         "height of the body", f"{shown(height, '.2f')} m above the floor", f"within {LARGEST_HEIGHT:.1f} m",
@@ -265,7 +265,7 @@ def check_variance(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_start_place(snapshot: PreflightSnapshot) -> Check:
-    """The column above the vehicle, up to the take-off height, must be inside the space."""
+    """Check that the column above the vehicle, up to the take-off height, is inside the space."""
     space, (x, y, _) = snapshot.mission.limits.space, snapshot.poses[-1].position
     above = np.array([(x, y, snapshot.mission.take_off_height)])
     (top,), _ = space.nearest(above)
@@ -279,11 +279,11 @@ def check_start_place(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_way_to_start(snapshot: PreflightSnapshot) -> Check:
-    """No obstacle stands on the way from take-off to the start, or beneath it, where link loss would end."""
+    """Check that no obstacle is on or below the way from take-off to the start, where link loss would end."""
     mission, limits = snapshot.mission, snapshot.mission.limits
     space, (x, y, _), (start, _) = limits.space, snapshot.poses[-1].position, mission.start
     name, threshold = "way to the start", "clear of obstacles by the margin, and so what is beneath"
-    if not space.obstacles:  # between walls a way is inside if both its ends are
+    if not space.obstacles:  # without obstacles, a straight way is inside if both ends are
         return Check(name, "no obstacles", threshold, True)
     begin, end = np.array([x, y, mission.take_off_height]), np.array(start)
     way = np.linspace(begin, end, int(np.linalg.norm(end - begin) / _WAY_STEP) + 2)
@@ -297,7 +297,7 @@ def check_way_to_start(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_plan_inside(snapshot: PreflightSnapshot) -> Check:
-    """Each setpoint and each stop; all of them on the path or within rounding of it."""
+    """Check each setpoint and each stop; all are on the path or within rounding of it."""
     space = snapshot.mission.limits.space
     planned, stops = (positions_of(each).reshape(-1, 3) for each in (snapshot.mission.payloads, snapshot.mission.stops))
     worst = max(space.farthest(planned), space.farthest(stops))
@@ -344,7 +344,7 @@ CHECKS: tuple[Callable[[PreflightSnapshot], Check], ...] = (
 
 
 def check_memory(snapshot: PreflightSnapshot) -> Check:
-    """What the memory holds was read back, and compared, when it was written."""
+    """Report the trajectory memory, which was read back and compared when it was written."""
     program = snapshot.mission.on_board
     assert program is not None
     kind = "compressed pieces" if program.compressed else "pieces"
@@ -352,7 +352,7 @@ def check_memory(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_watchdog(snapshot: PreflightSnapshot) -> Check:
-    """The on-board commander has no time-out: without the watchdog a vehicle without a link flies on, blind."""
+    """Check the watchdog: the on-board commander has no time-out, so a vehicle without a link would fly on, blind."""
     on, seconds = snapshot.mission.limits.firmware.watchdog, Timeouts().keep_alive
     return Check(
         "link loss on board", f"motors stop {seconds:g} s later" if on else "it flies on, blind",
@@ -361,7 +361,7 @@ def check_watchdog(snapshot: PreflightSnapshot) -> Check:
 
 
 def check_fall(snapshot: PreflightSnapshot) -> Check:
-    """The trajectory was looked at before; take-off from here and the way to the start are now."""
+    """Check the fall after link loss in take-off and on the way to the start; the trajectory was checked before."""
     mission, limits = snapshot.mission, snapshot.mission.limits
     assert mission.on_board is not None
     (x, y, z), height = snapshot.poses[-1].position, mission.take_off_height

@@ -30,34 +30,34 @@ from cfplan.flight.radio.connection import connect
 from cfplan.flight.real_time import STREAM_PRIORITY, lock_memory, shorten_time_slice, use_fifo_scheduling
 from cfplan.flight.telemetry import Telemetry
 
-_SWITCH_INTERVAL = 0.0001  # s; the stream gets the interpreter back after at most this
+_SWITCH_INTERVAL = 0.0001  # s, longest time until the stream gets the interpreter back
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
 _POLL_PERIOD = 0.02  # s between two polls for orders that are not keys
-LANDING_TIMEOUT = 60.0  # s that a pilot without a main process has to land
+LANDING_TIMEOUT = 60.0  # s for a pilot without a main process to land
 
 
 @dataclass(frozen=True, slots=True)
 class _Assignment:
-    """What the pilot's process is told once its flight is prepared."""
+    """The assignment that the pilot's process receives once its flight is prepared."""
 
     mission: Mission
     uri: str
     pose_source: PoseSource
-    environment: Mapping[str, str]  # of the main process by now: a lab that started meanwhile stands there
+    environment: Mapping[str, str]  # of the main process now: a lab started meanwhile is named there
     conducted: bool  # it is a vehicle of a fleet
 
 
 class PilotProcess:
-    """The pilot's process, which imports what it needs until it is assigned a mission; a context manager."""
+    """The pilot's process, which completes its imports before it is assigned a mission; a context manager."""
 
     def __init__(self, process: BaseProcess, telemetry: Connection, orders: Connection, proposals: Connection):
         self.process, self.telemetry = process, telemetry
-        self.orders = orders  # a fleet's conductor sends its messages here too, and hears those of the pilot
+        self.orders = orders  # also for messages to and from a fleet's conductor
         self.proposals = proposals  # for a planner's process: it sends proposals, and hears answers
         self._assigned = False
 
     def assign(self, mission: Mission, uri: str, pose_source: PoseSource, *, conducted: bool = False) -> None:
-        """Let it fly, as a vehicle of a fleet if it is conducted. Raises LinkError if it has died."""
+        """Start the flight, as a vehicle of a fleet if `conducted`. Raises LinkError if the process has died."""
         try:
             self.orders.send(_Assignment(mission, uri, pose_source, dict(os.environ), conducted))
         except OSError as why:
@@ -65,7 +65,7 @@ class PilotProcess:
         self._assigned = True
 
     def close(self) -> None:
-        """End it: at once on the ground, after its landing in flight. May be called twice."""
+        """End the process: at once on the ground, in flight after its landing. May be called twice."""
         self.orders.close()  # if this end fails, the pilot notices and lands
         self.telemetry.close()
         self.proposals.close()
@@ -149,11 +149,11 @@ class Attendant:
             try:
                 for order in source():
                     self._give(order)
-            except BaseException as error:  # the other source is still asked
+            except BaseException as error:  # the other source still counts
                 self._fail(error)
 
     def tell(self, messages: Sequence[Telemetry]) -> None:
-        """Tell the listener, unless it has failed."""
+        """Pass messages to the listener, unless it has failed."""
         if self.failure is None:
             try:
                 for message in messages:
@@ -167,7 +167,7 @@ class Attendant:
             self._give(Order.LAND)
 
     def conclude(self, last: FlightOutcome | CfplanError) -> FlightOutcome:
-        """Return the outcome of a flight by the pilot's last message. Raises what failed, here or there."""
+        """Return the outcome from the pilot's last message. Raises the failure, here or in the pilot."""
         if self.failure is not None:
             raise self.failure
         if isinstance(last, CfplanError):
@@ -215,13 +215,13 @@ def pilot_died(process: BaseProcess) -> LinkError:
 
 
 def _send(orders: Connection, lock: threading.Lock, order: Order) -> None:
-    with lock, contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
+    with lock, contextlib.suppress(OSError):  # a pilot that is gone shows in its telemetry
         orders.send(order)
 
 
 @contextlib.contextmanager
 def _signals_ignored():
-    """Block the terminal's signals: a process started meanwhile never sees a Ctrl-C, not even before its first line."""
+    """Block the terminal's signals, so that a process started meanwhile never receives a Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -244,7 +244,7 @@ class OrderReceiver(HeldOrders):
         threading.Thread(target=self._run, name="orders", daemon=True).start()
 
     def _run(self) -> None:
-        with contextlib.suppress(Exception):  # also after a message that is not an order: later ones cannot be trusted
+        with contextlib.suppress(Exception):  # an invalid message ends it too: later ones cannot be trusted
             while True:
                 message = self._connection.recv()
                 if self._conductor is not None and isinstance(message, ConductorMessage):
@@ -267,7 +267,7 @@ def _run(
     try:
         assignment: _Assignment = orders_connection.recv()
     except (EOFError, OSError):
-        os._exit(0)  # nothing is to be flown
+        os._exit(0)  # no flight
     os.environ.update(assignment.environment)
     uri = assignment.uri
     conductor = _conductor(orders_connection) if assignment.conducted else None
@@ -289,29 +289,29 @@ def _run(
         last = replace(pilot.fly(), telemetry_dropped=report.dropped)
     except CfplanError as error:
         last = error
-    except Exception as error:  # before take-off, or where even cutting broke
+    except Exception as error:  # before take-off, or if even the cut failed
         last = CfplanError(f"fault in the pilot: {error!r}", where=uri, hint="please report this")
     report.close(last)
-    os._exit(0)  # cflib leaves threads behind that never end
+    os._exit(0)  # cflib leaves threads that never end
 
 
 def _conductor(connection: Connection) -> HeldConductor:
     """Return the conductor at the other end of a connection."""
 
     def tell(message: PilotMessage) -> None:
-        with contextlib.suppress(OSError):  # a main process that is gone is noticed by its orders
+        with contextlib.suppress(OSError):  # a main process that is gone shows in its orders
             connection.send(message)
 
     return HeldConductor(tell, REAL_CLOCK.now)
 
 
 def _enter_real_time() -> None:
-    """Leave the processor to the flight: no garbage collection, and scheduled before ordinary programs."""
+    """Run in real time: no garbage collection, and scheduled before ordinary programs."""
     gc.collect()
     gc.freeze()
     gc.disable()
     with contextlib.suppress(OSError):
-        # The other threads too: one that waits for the processor while it holds the interpreter delays the stream.
+        # Other threads too: one that holds the interpreter while it waits for the processor delays the stream.
         for thread in map(int, os.listdir("/proc/self/task")):
             if not use_fifo_scheduling(_THREAD_PRIORITY, thread):
                 shorten_time_slice(thread)

@@ -1,4 +1,4 @@
-"""Proposals: where the pilot finds what a planner proposes, and answers it. The pilot never waits for a planner."""
+"""Proposals of a planner, as the pilot receives and answers them. The pilot never waits for a planner."""
 
 import contextlib
 import struct
@@ -13,8 +13,8 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
 LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
-LOOKS_UNTIL = 0.003  # s before a setpoint is due, until when the pilot looks at what comes; else once that is sent
-# kind, checksum of the proposal, of the commitment, and when setpoint 0 is due, or the proposal came, s
+LOOKS_UNTIL = 0.003  # s before a setpoint is due: proposals that arrive later wait until it is sent
+# kind; checksums of proposal and commitment; time, s, of setpoint 0 or of the proposal's arrival
 _ANSWER = struct.Struct("<8sIId")
 _BEGUN, _ACCEPTED, _REFUSED = b"begun   ", b"accepted", b"refused "
 
@@ -26,19 +26,19 @@ class ProposalSource(Protocol):
         """Tell the planner that setpoint 0 is due at `start`, s on the clock of time.monotonic(). Must not wait."""
 
     def wait(self, patience: float) -> bool:
-        """Wait for a proposal, at most for `patience`, s; return whether there is one, or False at once where none
-        comes between the pilot's ticks.
+        """Wait for a proposal, at most for `patience`, s; return whether there is one, or False at once if none
+        arrives between the pilot's ticks.
         """
 
     def newest(self) -> Proposal | None:
         """Return the newest proposal since the last call, None where there is none. Must not wait."""
 
     def answer(self, proposal: Proposal, answer: Commitment | Refusal) -> None:
-        """Tell the planner what became of a proposal. Must not wait."""
+        """Answer a proposal. Must not wait."""
 
 
 class NoProposals:
-    """No planner: the flight is that of its mission."""
+    """No planner: the mission is flown as it is."""
 
     def begin(self, start: float) -> None:
         pass
@@ -57,7 +57,7 @@ NO_PROPOSALS = NoProposals()
 
 
 class HeldProposals:
-    """The newest proposal, given by code in the pilot's own process; `on_answer` hears what became of each."""
+    """The newest proposal, given by code in the pilot's own process; `on_answer` gets the answers."""
 
     def __init__(self, on_answer: Callable[[Proposal, Commitment | Refusal], None] = lambda *_: None):
         self._newest: Proposal | None = None
@@ -67,7 +67,7 @@ class HeldProposals:
         pass
 
     def give(self, proposal: Proposal) -> None:
-        """Propose; a proposal that was not taken yet is forgotten."""
+        """Propose; replaces a proposal that was not taken yet."""
         self._newest = proposal
 
     def wait(self, patience: float) -> bool:
@@ -84,14 +84,14 @@ class HeldProposals:
 class ReceivedProposals(HeldProposals):
     """Proposals of a planner's process, read by a thread; another thread answers it.
 
-    A planner that died, hangs or sends what is no proposal is one that proposes nothing.
+    A planner that died, hangs or sends something else counts as one that proposes nothing.
     """
 
     def __init__(self, connection: Connection, clock: Clock = REAL_CLOCK):
         super().__init__(self._answer)
         self._connection, self._clock = connection, clock
         self._answers: SimpleQueue[bytes] = SimpleQueue()
-        self._came = (0, 0.0)  # checksum of the proposal that came last, and when, s
+        self._came = (0, 0.0)  # checksum and arrival, s, of the last proposal
         self._given = threading.Event()
         threading.Thread(target=self._read, name="proposals", daemon=True).start()
         threading.Thread(target=self._write, name="answers", daemon=True).start()
@@ -119,7 +119,7 @@ class ReceivedProposals(HeldProposals):
             self._answers.put(_ANSWER.pack(_REFUSED, proposal.checksum, 0, came) + str(answer).encode())
 
     def _read(self) -> None:
-        with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: it was closed here while it was read
+        with contextlib.suppress(EOFError, OSError, TypeError):  # TypeError: closed here while it was read
             while True:
                 message, proposal = self._connection.recv_bytes(LONGEST_MESSAGE), None
                 with contextlib.suppress(Exception):  # skip a message that cannot be read
@@ -136,17 +136,17 @@ class ReceivedProposals(HeldProposals):
 
 @dataclass(frozen=True, slots=True)
 class PilotAnswer:
-    """What a planner hears of the pilot."""
+    """A message of the pilot to a planner."""
 
-    begun: float | None = None  # s, when setpoint 0 is due, where that is told
+    begun: float | None = None  # s, when setpoint 0 is due, in the message that says so
     proposal: int = 0  # checksum of the proposal that is answered
-    commitment: int | None = None  # checksum of what is committed with it; None where it was refused
-    came: float = 0.0  # s, when the pilot had the proposal; 0 where another came meanwhile
+    commitment: int | None = None  # checksum of the new commitment; None if the proposal was refused
+    came: float = 0.0  # s, arrival of the proposal at the pilot; 0 if another arrived meanwhile
     reason: str = ""  # why it was refused
 
 
 def read_answer(message: bytes) -> PilotAnswer:
-    """Return what the pilot answered a planner. Raises ValueError where that is no answer."""
+    """Return the pilot's message to a planner. Raises ValueError if it is not one."""
     if len(message) < _ANSWER.size:
         raise ValueError(f"an answer of {len(message)} bytes")
     kind, proposal, commitment, time = _ANSWER.unpack_from(message)

@@ -9,13 +9,13 @@ from cfplan.flight.telemetry import Telemetry
 
 CAPACITY = 20_000  # messages: half a minute of a flight
 _PERIOD = 0.02  # s between batches
-_CLOSING_TIME = 2.0  # s that the end of a flight waits for a slow reader
+_CLOSING_TIME = 2.0  # s to wait for a slow reader at the end of a flight
 
 
 class Reporter:
     """Takes messages at once and sends them in batches from its own thread.
 
-    If the reader is slow or stuck, the oldest messages are dropped, and counted.
+    If the reader is slow or stuck, the oldest messages are dropped and counted.
     """
 
     def __init__(self, connection: Connection, capacity: int = CAPACITY, clock: Clock = REAL_CLOCK):
@@ -37,13 +37,13 @@ class Reporter:
             if batch:
                 self._connection.send(batch)
         except OSError:
-            return None  # no reader any more; the pilot learns that from its orders
-        except Exception:  # drop messages that cannot be sent, but none of the later ones
+            return None  # the reader is gone; the pilot learns that from its orders
+        except Exception:  # drop only the messages that cannot be sent
             self.dropped += len(batch)
         return _PERIOD
 
     def close(self, last: object) -> None:
-        """Send the waiting messages, then `last`, as far as the reader takes them within 2 s."""
+        """Send the waiting messages, then `last`, for at most 2 s."""
         end = self._clock.now() + _CLOSING_TIME
         if not self._sending.stop(_CLOSING_TIME):
             return

@@ -15,12 +15,12 @@ State = tuple[Triple, Triple, Triple, Quaternion, Triple]
 
 
 class Stream:
-    """Setpoints at a fixed rate from a start on; before it the first, after its end the last.
+    """Setpoints at a fixed rate from a start time; before it the first one, after the end the last one.
 
     `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
-    `stop_from` returns (M, 29) uint8, a way to stop from one of the setpoints, and is None for a stop and a descent.
+    `stop_from` returns (M, 29) uint8, a stop from one of the setpoints; None for a stop and a descent.
     Setpoints have numbers, from `first` to `last`; number 0 is due at the start. Everything slow is done when the
-    stream is made. Where the vehicle flies the motion `on_board`, nothing is sent: the setpoints say where it is to be.
+    stream is made. If the vehicle flies `on_board`, nothing is sent: the setpoints describe its planned motion.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class Stream:
         return self.start + self.last / self.rate
 
     def number(self, time: float) -> int:
-        """Return the number that the setpoint due at a time, s, has or would have."""
+        """Return the number of the setpoint due at a time, s, also beyond the last one."""
         return round((time - self.start) * self.rate)
 
     def index(self, time: float) -> int:
@@ -60,7 +60,7 @@ class Stream:
         return min(max(self.number(time), self.first), self.last)
 
     def packet(self, index: int) -> bytes:
-        """Return a setpoint as it goes over the radio."""
+        """Return a setpoint as a radio packet."""
         return pack(Port.SETPOINT, 0, self.payloads[index - self.first].tobytes())
 
     def state(self, index: int) -> State:
@@ -69,7 +69,7 @@ class Stream:
         return cast(State, tuple(tuple(field[row].tolist()) for field in self._fields))
 
     def position(self, time: float) -> Triple:
-        """Return where the vehicle is asked to be, m, at a time, s."""
+        """Return the position, m, of the setpoint at a time, s."""
         place = min(max((time - self.start) * self.rate, float(self.first)), float(self.last))
         before = min(int(place), self.last)
         share = place - before
@@ -82,6 +82,6 @@ class Stream:
 
 
 def stream_of(commitment: Commitment, rate: float, start: float = 0.0, *, on_board: bool = False) -> Stream:
-    """Return the stream of a commitment, of which setpoint 0 was or would have been due at `start`, s."""
+    """Return the stream of a commitment whose setpoint 0 is due at `start`, s."""
     first, stops = commitment.first, commitment.stops
     return Stream(commitment.payloads, rate, start, lambda number: stops[number - first], first, on_board=on_board)

@@ -1,6 +1,6 @@
-"""Manoeuvres by setpoints: from lift-off to the floor the vehicle flies by these alone.
+"""Streamed manoeuvres: from lift-off to the floor the vehicle is flown by setpoints only.
 
-It has time-outs for setpoints, and none for what its on-board commander flies.
+The firmware has time-outs for setpoints, but none for its on-board commander.
 """
 
 import math
@@ -20,7 +20,7 @@ from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Phase
 
 BRAKE_HOLD = 1.0  # s of hover after a stop
-_FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther off stops from the setpoint nearest to it
+_FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther away stops from the nearest setpoint
 
 
 class StreamedManoeuvres:
@@ -38,7 +38,7 @@ class StreamedManoeuvres:
         climb(loop, loop.begin(way), self._floor, self._mission.take_off_height, lambda: stop_motors(loop))
 
     def _way(self, begin: Place, end: Place, duration: float) -> Stream:
-        """Return setpoints from hover to hover, with a way to stop from each."""
+        """Return setpoints from hover to hover, with a stop from each."""
         rate = self._mission.rate
         motion = hover_to_hover(begin[:3], begin[3], end[:3], end[3], duration, rate)
         gains, space = gains_under(self._limits), self._limits.space
@@ -61,7 +61,7 @@ class StreamedManoeuvres:
         settle_at(loop, start)
 
     def fly_plan(self) -> None:
-        """Stream the plan, then hover for the mission's hold time; a new plan that comes meanwhile is flown too."""
+        """Stream the plan, then hover for the mission's hold time; a new plan that arrives meanwhile is flown too."""
         loop = self._loop
         loop.await_clearance(Phase.STREAM)
         skipped = loop.skipped
@@ -95,9 +95,9 @@ class StreamedManoeuvres:
         self._landing.land()
 
     def _stop(self) -> None:
-        """Brake along the path to a hover, or finish a stop that has begun; sink besides where poses are gone.
+        """Brake along the path to a hover, or finish a stop that has begun; if poses are gone, also sink.
 
-        A vehicle that was left alone is no longer on its path, and one whose poses are distrusted never was.
+        A vehicle that was without setpoints is no longer on its path, and one with distrusted poses never was.
         """
         loop, left = self._loop, self._loop.stream
         if left is None or self._landing.begun or loop.descent is Descent.HELD or loop.tracker.distrusted:
@@ -128,6 +128,6 @@ class StreamedManoeuvres:
             distance = math.dist(pose.position, stream.state(index)[0])
             if distance < least:
                 nearest, least = index, distance
-            elif distance > least + _FOLLOWS_WITHIN:  # what comes nearer again is another turn of the path
+            elif distance > least + _FOLLOWS_WITHIN:  # a distance that falls again belongs to another turn of the path
                 break
         return nearest

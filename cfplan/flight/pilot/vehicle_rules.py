@@ -1,7 +1,7 @@
-"""The parameters on board that must have a certain value, and the signs of another commander, each with its reason.
+"""Required parameters of the vehicle and signs of another commander, each with its reason.
 
-Preflight is run from this table, and the page on preflight is written from it. A row is data: a new one is set or read
-back, refused and documented by being here.
+Preflight runs from these tables, and its page in the docs is rendered from them: a new row is enough for a parameter to
+be set or read back, refused and documented.
 """
 
 import math
@@ -15,30 +15,30 @@ from cfplan.flight.setpoints.rate_trade import GAIN_TOLERANCE
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
 
-# Standard deviations that the vehicle's filter gives poses.
+# Standard deviations of poses in the vehicle's filter.
 EXTERNAL_POSITION_STD = 2e-3  # m
-"""Well above the 1 mm below which the filter keeps no standard deviation of its own (MIN_COVARIANCE of kalman_core.c).
+"""Well above 1 mm, the lower bound of the filter's own standard deviations (MIN_COVARIANCE of kalman_core.c).
 
-At 1 mm, as Crazyswarm2 sets it, that bound spoils the gains where poses come now before and now after a prediction: of
-2 m/s the filter believes 0.1 m/s less, and the vehicle flies 6 cm off its plan.
+At 1 mm, as Crazyswarm2 sets it, that bound distorts the gains when poses arrive at varying times between predictions:
+at 2 m/s the estimated velocity is 0.1 m/s too low, and the vehicle deviates by 6 cm.
 """
-EXTERNAL_ATTITUDE_STD = 5e-2  # rad, as Crazyswarm2 sets it: a filter that trusts attitude more has trouble with yaw
+EXTERNAL_ATTITUDE_STD = 5e-2  # rad, as in Crazyswarm2; with a smaller value the filter has trouble with yaw
 GAIN_TOLERANCE_OF_FIRMWARE = 0.05
-"""Share by which a gain may differ from the firmware's own; at a motor lag of 0.13 s it adds up to 0.3 cm."""
+"""Relative tolerance of a gain; at a motor lag of 0.13 s it adds up to 0.3 cm of deviation."""
 TRADED_GAIN_TOLERANCE = GAIN_TOLERANCE / (2.0 + GAIN_TOLERANCE)
-"""The same for kR_xy and kw_xy, so that their ratio is within its tolerance; that adds up to 1 cm."""
-MIN_ARMED_TIME = 5000  # ms: arming, its repeats and take-off fit into it
+"""The same for kR_xy and kw_xy, so that their ratio keeps its tolerance, which adds up to 1 cm."""
+MIN_ARMED_TIME = 5000  # ms, enough for arming with repeats and for take-off
 _FULL_COMMAND = 65535  # of one motor
-_FLOAT32_TOLERANCE = 1e-6  # share by which what is read back may differ: parameters are float32
+_FLOAT32_TOLERANCE = 1e-6  # relative, of a value that is read back: parameters are float32
 
 Interval = tuple[float, float]
 
 
 class Action(StrEnum):
-    """What cfplan does about a parameter."""
+    """How cfplan handles a parameter."""
 
-    SET = "set"  # written at each flight, and refused if it does not read back; a restart brings the old value back
-    REFUSED = "refused"  # only read: the flight is refused outside what is allowed
+    SET = "set"  # written before each flight and read back; a restart restores the old value
+    REFUSED = "refused"  # only read: other values refuse the flight
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,23 +46,21 @@ class ParameterRule:
     """One parameter of the vehicle that must have a certain value."""
 
     name: str
-    allowed: Callable[
-        [Limits], tuple[Interval, ...]
-    ]  # the value lies in one of these; the first begins with the wanted
-    allowed_text: str  # the same in words
+    allowed: Callable[[Limits], tuple[Interval, ...]]  # allowed intervals; the first begins with the value to set
+    allowed_text: str  # the allowed values in words
     action: Action
     reason: str  # one sentence
     hint: str  # what to do
-    since: tuple[int, ...] = ()  # the firmware that has it first; (): each that may fly
+    since: tuple[int, ...] = ()  # first firmware with it; (): all that may fly
     optional: bool = False  # a vehicle without it may fly
-    missing: str = ""  # what a vehicle without it is warned of
+    missing: str = ""  # warning for a vehicle without it
 
     def value(self, limits: Limits) -> float:
-        """Return the value that cfplan writes, or for one that is only read, one that it accepts."""
+        """Return the value that cfplan writes; for a parameter that is only read, one that it accepts."""
         return self.allowed(limits)[0][0]
 
     def accepts(self, value: float | None, limits: Limits) -> bool:
-        """Return whether a value that was read may fly; None if the vehicle lacks the parameter."""
+        """Return whether a flight may start with this value; None if the vehicle lacks the parameter."""
         if value is None:
             return self.optional
         return any(
@@ -73,7 +71,7 @@ class ParameterRule:
         )
 
     def threshold(self, limits: Limits) -> str:
-        """Return what is allowed, in figures and in words."""
+        """Return the allowed values, in figures and in words."""
         intervals = self.allowed(limits)
         figures = " or ".join(
             _figures(each) for each in intervals if not any(_within(each, wide) for wide in intervals)
@@ -251,7 +249,7 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
     ),
 )  # fmt: skip
 
-# What preflight shows in one line each.
+# Groups that preflight shows in one line each.
 PARAMETER_GROUPS: dict[str, tuple[ParameterRule, ...]] = {
     "parameters read back": tuple(rule for rule in PARAMETER_RULES if rule.action is Action.SET),
     "settings on board": tuple(
@@ -265,7 +263,7 @@ PARAMETER_GROUPS: dict[str, tuple[ParameterRule, ...]] = {
 
 @dataclass(frozen=True, slots=True)
 class Traffic:
-    """What a second of listening before take-off shows of other commanders."""
+    """Signs of other commanders heard in a second before take-off."""
 
     supervisor: int  # bits of supervisor.info that were set at any moment
     replies: tuple[int, ...]  # commands of the on-board commander that were answered, though cfplan sent none
@@ -274,7 +272,7 @@ class Traffic:
 
 @dataclass(frozen=True, slots=True)
 class CommanderSign:
-    """One sign that somebody else commands the vehicle."""
+    """A sign that another client commands the vehicle."""
 
     name: str
     seen: Callable[[Traffic], bool]
@@ -304,7 +302,7 @@ COMMANDER_SIGNS: tuple[CommanderSign, ...] = (
     ),
 )  # fmt: skip
 
-# What no vehicle tells over the radio: each with the reason.
+# What cannot be read over the radio, each with the reason.
 UNKNOWABLE: tuple[tuple[str, str], ...] = (
     ("who sends setpoints", "The firmware logs the setpoint in force, not where it came from."),
     (

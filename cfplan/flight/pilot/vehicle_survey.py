@@ -1,4 +1,4 @@
-"""A look at a vehicle without flying it: what preflight would say of its firmware and of what is set on board."""
+"""Survey of a vehicle without flying it: preflight's checks of firmware and parameters."""
 
 from cfplan.flight.pilot.outcome import Check
 from cfplan.flight.pilot.preflight import check_rule, firmware_check, timeouts_check
@@ -8,7 +8,7 @@ from cfplan.safety.limits import Limits
 
 
 def survey_vehicle(link: Link, limits: Limits) -> tuple[Check, ...]:
-    """Read what preflight rests on, and change nothing. What each flight sets passes, whatever it is now.
+    """Read what preflight checks, and change nothing. Parameters that each flight sets pass with any value.
 
     Raises LinkError if the vehicle does not answer.
     """

@@ -30,9 +30,9 @@ def connect(
     clock: Clock = REAL_CLOCK,
     patience: float = FIRST_ANSWER_TIMEOUT,
 ) -> Link:
-    """Connect, and end the state in which an earlier connection left the vehicle.
+    """Connect, and release what an earlier connection left set on the vehicle.
 
-    `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while nothing happens, and may raise.
+    `drivers` are cflib link drivers tried before cflib's own. `waiting` is called while waiting, and may raise.
     Raises LinkError, after `patience`, s, and within 1 s more, if nothing answers.
     """
     lock, end = lock_radio(uri), clock.now() + patience
@@ -63,7 +63,7 @@ def _open(session: Session, patience: float) -> None:
 
 
 class _Opening:
-    """A transport that opens in a thread, as a driver may wait for a computer that does not answer."""
+    """A transport that opens in a thread, as a driver may block on a host that does not answer."""
 
     def __init__(self, uri: str, clock: Clock):
         self._uri, self._clock = uri, clock
@@ -77,14 +77,14 @@ class _Opening:
         try:
             dongle = self._uri.startswith("radio://")
             self._transport = open_dongle(self._uri, self._clock) if dongle else DriverTransport(self._uri)
-        except Exception as error:  # cflib and pyusb raise what they like
+        except Exception as error:  # cflib and pyusb raise many types
             self._error = error
         self._done.set()
         if self._abandoned:
             self._close()
 
     def wait(self, patience: float, waiting: Callable[[], None]) -> Transport:
-        """Return it once it is open. Raises LinkError if it cannot be opened within `patience`, s."""
+        """Return the transport once it is open. Raises LinkError if it is not within `patience`, s."""
         end = self._clock.now() + patience
         while not self._done.is_set() and self._clock.now() < end:
             waiting()

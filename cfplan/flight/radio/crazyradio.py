@@ -5,10 +5,10 @@ from typing import Any
 from cfplan.errors import LinkError
 
 CRAZYRADIO = (0x1915, 0x7777)  # vendor and product; also of a Crazyradio 2.0 that emulates a Crazyradio PA
-OTHER_FIRMWARE = (0x35F0, 0xBAD2)  # Crazyradio 2.0 with its own
+OTHER_FIRMWARE = (0x35F0, 0xBAD2)  # Crazyradio 2.0 with its own firmware
 _DENIED, _BUSY = 13, 16
 
-# For Crazyradio, Crazyradio 2.0 and the Crazyflie on a cable, as on Bitcraze's own page.
+# For Crazyradio, Crazyradio 2.0 and the Crazyflie over USB, as documented by Bitcraze.
 UDEV_RULES = (
     """printf 'SUBSYSTEM=="usb", ATTRS{idVendor}=="%s", MODE="0664", GROUP="plugdev"\\n' 1915 35f0 0483 """
     "| sudo tee /etc/udev/rules.d/99-bitcraze.rules && sudo udevadm control --reload-rules"
@@ -32,7 +32,7 @@ def find_radios(kind: tuple[int, int] = CRAZYRADIO) -> list[Any]:
 def check_radio(uri: str) -> None:
     """Raise LinkError with a hint if the radio of a URI is absent, not permitted or used by another program.
 
-    Claims the radio for a moment, as cflib will. A URI that does not name the radio by its number is left to cflib.
+    Claims the radio for a moment, as cflib will. A URI without the radio's number is left to cflib.
     """
     number = uri.removeprefix("radio://").partition("/")[0]
     if not uri.startswith("radio://") or not number.isdecimal() or len(number) >= 10:
@@ -71,7 +71,7 @@ def _take(radio: Any, uri: str) -> None:
 
 
 def usb_hint(number: int | None, text: str) -> str:
-    """Return what to do about a USB error; "" where that is not known."""
+    """Return a hint for a USB error; "" if there is none."""
     text = text.lower()
     if number == _DENIED or "denied" in text or "permission" in text:
         return f"allow it once: {UDEV_RULES}; then unplug and plug in"

@@ -1,9 +1,9 @@
-"""CRTP packets as they go over the air: a header of port and channel, then at most 30 bytes."""
+"""CRTP packets: a header of port and channel, then at most 30 bytes."""
 
 from enum import IntEnum
 
 LARGEST_PAYLOAD = 30
-NULL_PACKET = b"\xff"  # asks for nothing; a vehicle answers it
+NULL_PACKET = b"\xff"  # empty; a vehicle answers it
 
 
 class Port(IntEnum):

@@ -1,7 +1,7 @@
-"""The transport by a Crazyradio: cflib drives the dongle; this file decides which packet it transmits next.
+"""Transport over a Crazyradio: cflib drives the dongle; this module decides which packet it transmits next.
 
-The radio is polled: each transmission is acknowledged by the vehicle, whose packets come with the acknowledgements.
-Safelink counts the packets both ways by one bit each, in the header, so that a repetition is told from a new packet.
+The radio is polled: the vehicle acknowledges each transmission, and its packets are carried by the acknowledgements.
+Safelink marks packets in both directions with a one-bit counter in the header, so that repetitions are recognised.
 """
 
 import queue
@@ -13,24 +13,22 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.radio.perishable import Outbox
 from cfplan.flight.radio.transport import Fail, Hear, start_receiver
 
-PATIENCE = 0.005  # s that a packet waits for a busy radio; then it is dropped, as the next one is fresher
-DEAD_AFTER = 10.0  # s without an acknowledgement; a vehicle that hovers alone is worth waiting for
-_UNANSWERED_PAUSE = (
-    0.001  # s after a transmission that the dongle does not report on: one that is unplugged fails at once
-)
-_SAFELINK = bytes((0xFF, 0x05, 0x01))  # begins it; a vehicle that has it answers the same
+PATIENCE = 0.005  # s to wait for a busy radio; then the packet is dropped, as the next one is fresher
+DEAD_AFTER = 10.0  # s without an acknowledgement; a vehicle that hovers may come back
+_UNANSWERED_PAUSE = 0.001  # s after a transmission without a report: an unplugged dongle fails at once
+_SAFELINK = bytes((0xFF, 0x05, 0x01))  # requests safelink; a vehicle that supports it echoes this
 _SAFELINK_ATTEMPTS = 10
-_UP, _DOWN = 3, 2  # bits of the header with the counters
+_UP, _DOWN = 3, 2  # bits of the counters in the header
 _COUNTERS = 1 << _UP | 1 << _DOWN
 _NULL = 0xF3  # header of an empty packet, without the counters
-_IDLE_AFTER, _IDLE_PERIOD = 10, 0.01  # acknowledgements without any byte; s between transmissions from then on
+_IDLE_AFTER, _IDLE_PERIOD = 10, 0.01  # after this many empty acknowledgements, s between transmissions
 
 
 class Dongle:
-    """A link to one vehicle by a Crazyradio."""
+    """A link to one vehicle over a Crazyradio."""
 
     def __init__(self, radio: Any, clock: Clock = REAL_CLOCK, period: float = 0.0):
-        """Take a `cflib.drivers.crazyradio.Crazyradio` that is tuned; `period`, s, is the least per transmission."""
+        """Take a `cflib.drivers.crazyradio.Crazyradio` that is tuned; `period`, s, is the least time each."""
         self._radio, self._clock, self._period = radio, clock, period
         self._outbox, self._changed = Outbox(), threading.Condition()
         self._received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
@@ -63,10 +61,10 @@ class Dongle:
             return None
 
     def _run(self) -> None:
-        """Transmit without a pause, as the vehicle's packets come with acknowledgements alone."""
+        """Transmit continuously, as the vehicle's packets come only with acknowledgements."""
         try:
             self._transmit(safelink=any(self._has_safelink() for _ in range(_SAFELINK_ATTEMPTS)))
-        except Exception as error:  # pyusb raises what it likes
+        except Exception as error:  # pyusb raises many types
             self._fail(f"the Crazyradio failed: {error}")
 
     def _has_safelink(self) -> bool:

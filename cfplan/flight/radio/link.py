@@ -18,10 +18,10 @@ from cfplan.vehicle.airframe import GRAVITY
 
 _MOTOR_TEST = "motorPowerSet.enable"
 _ANSWER_TIMEOUT = 2.0  # s
-_CLOSE_TIMEOUT = 2.0  # s that closing may take
+_CLOSE_TIMEOUT = 2.0  # s for closing
 
 _MILLI = 1e-3
-_CLOCK_DRIFT = 5e-4  # by which the vehicle's clock may differ
+_CLOCK_DRIFT = 5e-4  # relative difference of the vehicle's clock
 _STAMPS_WRAP = (1 << 24) * _MILLI  # s
 _ESTIMATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
 ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
@@ -31,20 +31,20 @@ STATUS_LOG = (
     + [("pm.vbatMV", "uint16_t"), ("supervisor.info", "uint16_t")],
     20,
 )
-# The setpoint in force: place, velocity and acceleration, and from firmware 2026.08 on the modes, which tell of any.
+# The setpoint in force: position, velocity and acceleration; from firmware 2026.08 on also its modes.
 TARGET_LOG = ([(f"ctrltargetZ.{name}", "int16_t") for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")], 40)
 TARGET_MODES = [(f"ctrltarget.mode_{name}", "uint8_t") for name in ("x", "y", "z", "roll", "pitch", "yaw", "quat")]
 VARIANCE_LOG = ([(f"kalman.var{axis}", "float") for axis in "XYZ"], 10)
 
 
 class Link:
-    """A connected Crazyflie, made by `connection.connect`, or in a stepped lab by its own."""
+    """A connected Crazyflie, made by `connection.connect` or by a stepped lab."""
 
     def __init__(
         self,
         session: Session,
         report: Callable[[Telemetry], None],
-        restart: Callable[[], None],  # of the vehicle's main processor, once the link is closed; raises LinkError
+        restart: Callable[[], None],  # restarts the vehicle's main processor once the link is closed; raises LinkError
         radio_lock: IO[str] | None = None,  # keeps other pilots from the radio until the link closes
     ):
         self._session, self._report, self._clock = session, report, session.clock
@@ -52,20 +52,20 @@ class Link:
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance: Triple | None = None  # m² along x, y, z
-        self.has_setpoint = False  # the controller has one, from whomever; known until `stop_preflight_logs`
-        self.replies: dict[int, int] = {}  # command of the on-board commander: the code that it answered, 0 for done
-        self.motor_test = False  # a motor test overrides the controller, by the last answer to `ask_motor_test`
-        self._motor_test = b""  # the number of its parameter, as packets have it, once it was asked for
+        self.has_setpoint = False  # the controller has one, from any client; known until `stop_preflight_logs`
+        self.replies: dict[int, int] = {}  # by command of the on-board commander: the code of its answer, 0 for done
+        self.motor_test = False  # whether a motor test is on, by the last answer to `ask_motor_test`
+        self._motor_test = b""  # packed number of its parameter, once it was queried
         self._preflight_blocks: list[LogBlock] = []
-        self._log_recreation: dict[str, Iterator[bytes | None]] = {}  # packets that create a log anew, by its name
-        # s, when the vehicle's clock of ms was zero, according to the quickest messages; when the last message came
+        self._log_recreation: dict[str, Iterator[bytes | None]] = {}  # packets that recreate a log, by its name
+        # s: zero of the vehicle's clock according to the quickest messages; arrival of the last message
         self._log_zero, self._log_heard = math.inf, 0.0
         session.listen(Port.HIGH_LEVEL, self._on_reply)
         session.listen(Port.PARAMETERS, self._on_parameter)
 
     @property
     def lost(self) -> str:
-        """Return why the link is gone; empty while it stands."""
+        """Return why the link is lost; empty while it is up."""
         return self._session.lost
 
     @property
@@ -92,14 +92,14 @@ class Link:
         self.send(pack(port, channel, data))
 
     def send(self, packet: bytes) -> None:
-        """Send a packet. A link that is gone takes it silently: watch `lost`."""
+        """Send a packet; a lost link drops it silently, see `lost`."""
         self._session.send(packet)
 
     def send_pose(self, position: Sequence[float], quaternion: Sequence[float]) -> None:
         self._send(Port.LOCALIZATION, 1, struct.pack("<B7f", EXTERNAL_POSE, *position, *quaternion))
 
     def release_priority(self) -> None:
-        """Give the vehicle back to its on-board commander."""
+        """Hand the vehicle back to its on-board commander."""
         self._send(Port.SETPOINT, 1, struct.pack("<BI", 0, 0))
 
     def command(self, command: bytes) -> None:
@@ -124,27 +124,27 @@ class Link:
             self._send(Port.LOCALIZATION, 1, b"\x03")
 
     def keep_alive(self) -> None:
-        """Feed the vehicle's emergency-stop watchdog, which the first call starts for good."""
+        """Feed the vehicle's emergency-stop watchdog; the first call starts it, and it cannot be stopped."""
         if self.protocol >= 12:
             self._send(Port.SUPERVISOR, 1, b"\x04")
         else:
             self._send(Port.LOCALIZATION, 1, b"\x04")
 
     def ask_motor_test(self) -> None:
-        """Ask whether a motor test is on; `motor_test` is set when the answer comes."""
+        """Ask whether a motor test is on; `motor_test` is set when the answer arrives."""
         number = self._parameter_number(_MOTOR_TEST)
         if number is not None:
             self._motor_test = struct.pack("<H", number)
             self._send(Port.PARAMETERS, READ_PARAMETER, self._motor_test)
 
     def end_motor_test(self) -> None:
-        """Switch a motor test off: it turns the motors whatever controller, arming and emergency stop say."""
+        """Switch a motor test off; it overrides controller, arming and emergency stop."""
         number = self._parameter_number(_MOTOR_TEST)
         if number is not None:
             self._send(Port.PARAMETERS, WRITE_PARAMETER, struct.pack("<HB", number, 0))
 
     def recreate_log(self, name: str) -> None:
-        """Send the next packet that creates `estimate` or `status` anew; call it each tick while that is silent."""
+        """Send the next packet that recreates the log `estimate` or `status`; call it each tick while it is silent."""
         payload = next(self._log_recreation[name])
         if payload is not None:
             self._send(Port.LOG, SETTINGS_CHANNEL, payload)
@@ -163,7 +163,7 @@ class Link:
         return name in self._session.log_variables
 
     def read_parameters(self, names: Sequence[str], patience: float = _ANSWER_TIMEOUT) -> dict[str, float]:
-        """Return the values of those parameters that the vehicle has, as it has them now.
+        """Return the present values of those parameters that the vehicle has.
 
         Raises LinkError if the vehicle does not answer for `patience`, s.
         """
@@ -196,12 +196,12 @@ class Link:
         ]
 
     def stop_preflight_logs(self) -> None:
-        """Stop the logs of `position_variance` and `has_setpoint`: in flight the radio has better to do."""
+        """Stop the logs of `position_variance` and `has_setpoint`: in flight the radio is needed for other packets."""
         for block in self._preflight_blocks:
             self._send(Port.LOG, SETTINGS_CHANNEL, block.stop())
 
     def close(self) -> None:
-        """Close the link. On the ground only: in the air nothing else reaches the vehicle."""
+        """Close the link. Only on the ground: in the air it is the only way to reach the vehicle."""
         closing = threading.Thread(target=self._session.close, daemon=True)  # a driver may wait for its thread
         closing.start()
         closing.join(timeout=_CLOSE_TIMEOUT)
@@ -211,10 +211,10 @@ class Link:
     # Callbacks: these run in the transport's thread and must be quick.
 
     def _written_at(self, stamp_ms: int) -> float:
-        """Return when, s, the vehicle wrote a message: after a pause of the radio, old ones arrive."""
+        """Return when, s, the vehicle wrote a message; after a pause of the radio, old ones arrive."""
         now = self._clock.now()
         zero = now - stamp_ms * _MILLI
-        if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first, or the vehicle's 24 bits began anew
+        if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first message, or the 24 bits wrapped
             self._log_zero = zero
         self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self._log_heard), zero)
         self._log_heard = now
@@ -227,7 +227,7 @@ class Link:
             time=self._written_at(stamp_ms),
             position=(x, y, z),
             velocity=(vx, vy, vz),
-            acceleration=(ax, ay, az - GRAVITY),  # the log counts gravity in
+            acceleration=(ax, ay, az - GRAVITY),  # the log includes gravity
             quaternion=(float(q[0]), float(q[1]), float(q[2]), float(q[3])),
         )
         self._report(self.estimate)

@@ -13,9 +13,9 @@ SETTINGS_CHANNEL, DATA_CHANNEL = 1, 2
 DELETE, RESET = 2, 5
 _STOP, _CREATE, _APPEND, _START = 4, 6, 7, 8
 _MAX_PER_PACKET = 9  # variables
-_RETRY_TICKS = 30  # from one attempt to the next
+_RETRY_TICKS = 30  # between attempts
 _TYPES = {"uint8_t": (1, "B"), "uint16_t": (2, "H"), "uint32_t": (3, "I"), "int16_t": (5, "h"), "float": (7, "f")}
-_HEAD = 4  # bytes of a message: number of the block, ms in 24 bits
+_HEAD = 4  # bytes of a message: block number, then ms in 24 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,9 +37,9 @@ class LogBlock:
         return *made, struct.pack("<BBH", _START, self.number, self.period_ms)
 
     def recreation(self) -> Iterator[bytes | None]:
-        """Yield one payload a tick, without end; together they create the block anew, whether or not it exists.
+        """Yield one payload per tick, endlessly; together they recreate the block, whether or not it exists.
 
-        None stands for a tick without a packet, so that the log has time to come.
+        None stands for a tick without a packet, which gives the log time to arrive.
         """
         return itertools.cycle((bytes((DELETE, self.number)), *self.creation(), *(None,) * _RETRY_TICKS))
 
@@ -48,7 +48,7 @@ class LogBlock:
         return bytes((_STOP, self.number))
 
     def decode(self, message: bytes) -> dict[str, Any] | None:
-        """Return the values of a message by name; None if its length is wrong, as of a block that is half created."""
+        """Return the values of a message by name; None if its length is wrong, as for a partly created block."""
         layout = "<" + "".join(_TYPES[kind][1] for _, kind, _ in self.variables)
         if len(message) != _HEAD + struct.calcsize(layout):
             return None

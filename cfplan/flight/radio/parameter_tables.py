@@ -13,19 +13,19 @@ from cfplan.flight.radio.crtp import Port
 _CHANNEL = 0
 _ITEM, _INFO = b"\2", b"\3"
 
-Table = Mapping[str, tuple[int, int]]  # by full name: number in packets, and type as the wire has it
+Table = Mapping[str, tuple[int, int]]  # full name: (number, type code), as in packets
 Ask = Callable[[Port, int, bytes, int], bytes]  # as `Session.ask`
 
 
 class TableCache:
-    """Known tables by port and checksum, which changes with each table; also in a folder, if one is given."""
+    """Known tables by port and checksum, in memory and, if a folder is given, on disk."""
 
     def __init__(self, folder: Path | None = None):
         self._folder = folder
         self._known: dict[str, Table] = {}
 
     def add(self, port: Port, checksum: int, table: Table) -> None:
-        """Add a table; where the folder cannot be written, for this process alone."""
+        """Add a table; if the folder cannot be written, only for this process."""
         name = _name(port, checksum)
         self._known[name] = table
         if self._folder is not None:
@@ -33,7 +33,7 @@ class TableCache:
                 file.write_text(json.dumps(table))
 
     def find(self, port: Port, checksum: int) -> Table | None:
-        """Return a table that was added, also by another process; None if there is none that can be read."""
+        """Return a cached table, also of another process; None if there is none that can be read."""
         name = _name(port, checksum)
         if name not in self._known and self._folder is not None:
             with suppress(OSError, ValueError, TypeError, AttributeError):
@@ -47,7 +47,7 @@ def _name(port: Port, checksum: int) -> str:
 
 
 def disk_table_cache() -> TableCache:
-    """Return the tables that are cached between connections; where no folder can be made, for this process alone."""
+    """Return the cache that is kept between connections; if no folder can be made, only for this process."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     folder = Path(base) / "cfplan" / "tables"
     try:
@@ -72,6 +72,6 @@ def read_table(port: Port, ask: Ask, tables: TableCache) -> Table:
 
 
 def _full_name(item: bytes) -> str:
-    """Return the full name in an item: after command, number and type, group and name end with a zero each."""
+    """Return the full name in an item: command, number, type, then group and name, each ended by a zero."""
     group, name = item[4:].split(b"\0")[:2]
     return f"{group.decode('ascii')}.{name.decode('ascii')}"

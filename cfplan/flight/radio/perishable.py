@@ -1,15 +1,15 @@
-"""Packets that wait for a polled radio; setpoints and poses among them perish, as a vehicle takes them for fresh.
+"""Packets waiting for a polled radio; setpoints and poses expire, as a vehicle treats every one as new.
 
 A Crazyradio repeats the packet in the air until it is acknowledged, and one more waits behind it. A radio that was dead
-would send both when it returns, and an old pose throws the vehicle's estimate back by as far as it has come since.
-So a perishable packet that waits for long gives its place to the next one, and is repeated in the air as an empty one.
+would send both when it returns, and an old pose would set the vehicle's estimate back by the distance flown since.
+Therefore an expired packet is replaced by the next one, and in the air it is repeated as an empty packet.
 """
 
 from cfplan.flight.radio.crtp import NULL_PACKET, Port
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE
 
 EXTERNAL_POSE = 8
-MAX_AGE = 0.05  # s; under heavy loss a packet is acknowledged sooner
+MAX_AGE = 0.05  # s, of setpoints and poses; even under heavy loss packets are acknowledged sooner
 
 
 def is_perishable(packet: bytes) -> bool:
@@ -19,7 +19,7 @@ def is_perishable(packet: bytes) -> bool:
 
 
 class Outbox:
-    """The packet in the air and the one that waits behind it, each with the time, s, at which it was put."""
+    """The packet in the air and the one that waits behind it, each with the time, s, at which it was added."""
 
     def __init__(self) -> None:
         self._in_air: tuple[float, bytes] | None = None
@@ -31,7 +31,7 @@ class Outbox:
         return self._in_air is None
 
     def put(self, packet: bytes, now: float) -> bool:
-        """Take a packet for the air or to wait; return False if a packet waits that is still worth sending."""
+        """Add a packet; return False if another one is waiting that has not expired."""
         if self._in_air is None:
             self._in_air = now, packet
         elif self._waiting is None or _perished(*self._waiting, now):

@@ -3,17 +3,17 @@
 from cfplan.errors import LinkError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 
-# In a packet for the link port's null channel; the vehicle's radio processor obeys it, its main processor need not run.
+# In packets of the link port's null channel, handled by the vehicle's radio processor even if the main one is off.
 POWER_CHANNEL, POWER = 3, 0xFE
 SYSTEM_OFF, SYSTEM_ON = 2, 3
-BOOT = 1.0  # s from power on until it answers, at most
+BOOT = 1.0  # s from power-on to the first answer, at most
 _ATTEMPTS = 3
 
 
 def restart_vehicle(uri: str, clock: Clock = REAL_CLOCK) -> None:
     """Switch a vehicle's main processor off and, 1 s later, on; on the ground, with no link open.
 
-    It is back when this returns, and answers whoever connects next. Raises LinkError if the vehicle does not confirm.
+    It accepts connections when this returns. Raises LinkError if the vehicle does not confirm.
     """
     from cflib.utils.power_switch import PowerSwitch
 
@@ -26,7 +26,7 @@ def restart_vehicle(uri: str, clock: Clock = REAL_CLOCK) -> None:
                 switch.close()
             clock.sleep(BOOT)
             return
-        except Exception as error:  # cflib raises nothing more precise
+        except Exception as error:  # cflib raises nothing more specific
             if not left:
                 raise LinkError(
                     f"the vehicle cannot be restarted: {error}", where=uri, hint="switch it off and on by hand"

@@ -1,7 +1,7 @@
 """One CRTP session with a vehicle over any transport: requests with answers, parameters, logs, memory and pings.
 
-A request is repeated until its answer comes, whether or not the transport is reliable: all requests may arrive twice.
-Packets of flight are sent once and wait for nothing.
+A request is repeated until it is answered, on reliable transports too, so every request must tolerate arriving twice.
+Packets in flight are sent once, without waiting for an answer.
 """
 
 import struct
@@ -19,32 +19,32 @@ from cfplan.flight.radio.log_block import DATA_CHANNEL, DELETE, RESET, SETTINGS_
 from cfplan.flight.radio.parameter_tables import Table, TableCache, read_table
 from cfplan.flight.radio.transport import Transport
 
-TABLES_TIMEOUT = 30.0  # s, from the first answer to the last table, over a lossy radio that reads each item
+TABLES_TIMEOUT = 30.0  # s, from the first answer to the last table, read item by item over a lossy radio
 PING_PERIOD = 0.1  # s
 READ_PARAMETER, WRITE_PARAMETER = 1, 2  # channels
 _RETRY_PERIOD = 0.2  # s
 _LOOK_PERIOD = 0.02  # s between calls of `waiting`
 _MAX_PINGS = 100  # for the round trip: 10 s
-_ECHO, _VERSION = 0, 1  # channels of the link and the platform port
+_ECHO, _VERSION = 0, 1  # channels: of the link port, of the platform port
 _PROTOCOL, _FIRMWARE = b"\0", b"\1"
 _MEMORY_INFO, _MEMORY_READ, _MEMORY_WRITE = range(3)
 _TRAJECTORY_MEMORY = 0x12  # type of memory
 _CHUNK = 24  # bytes of memory in a packet
-_UPLOAD_TIMEOUT = 30.0  # s for 4,096 bytes there and back, which take some 340 packets
+_UPLOAD_TIMEOUT = 30.0  # s to write and read back 4,096 bytes, in some 340 packets
 _LOG_ATTEMPTS = 5  # to create a log
 
-# Types of parameters as the table has them, with flags.
+# Type codes of parameters in the table, with flags.
 _TYPE_MASK, _READ_ONLY = 0x0F, 0x40
 _LAYOUTS = {0x08: "<B", 0x09: "<H", 0x0A: "<I", 0x0B: "<Q", 0x00: "<b", 0x01: "<h", 0x02: "<i", 0x03: "<q", 0x06: "<f",
             0x07: "<d"}  # fmt: skip
 
 
 class Session:
-    """A session; `open` makes it usable. While it waits for an answer it calls `waiting`, which may raise."""
+    """A session, usable after `open`. While it waits for an answer it calls `waiting`, which may raise."""
 
     def __init__(self, transport: Transport, uri: str, clock: Clock, waiting: Callable[[], None] = lambda: None):
         self.uri, self.clock = uri, clock
-        self.lost = ""  # why the link is gone; empty while it stands
+        self.lost = ""  # why the link is lost; empty while it is up
         self.protocol, self.firmware = -1, ""
         self.parameters: Table = {}
         self.log_variables: Table = {}
@@ -52,9 +52,9 @@ class Session:
         self._transport, self._waiting = transport, waiting
         self._listeners: dict[int, Callable[[int, bytes], None]] = {}
         self._logs: dict[int, tuple[LogBlock, Callable[[int, dict[str, Any]], None]]] = {}
-        self._expected: tuple[int, int, bytes] | None = None  # port, channel and beginning of the answer waited for
+        self._expected: tuple[int, int, bytes] | None = None  # port, channel and first bytes of the expected answer
         self._answer, self._answered = b"", threading.Event()
-        self._pings: dict[bytes, float] = {}  # unanswered, each with the time, s, at which it was sent
+        self._pings: dict[bytes, float] = {}  # unanswered, with the time, s, of sending
         self._round_trips: deque[float] = deque(maxlen=_MAX_PINGS)
         self._pinged = 0
         transport.listen(self.hear, self.fail)
@@ -95,22 +95,22 @@ class Session:
         return float(np.percentile(self._round_trips, 95)) if self._round_trips else 0.0
 
     def listen(self, port: Port, note: Callable[[int, bytes], None]) -> None:
-        """Call `note` with channel and payload of each packet that comes from a port."""
+        """Call `note` with channel and payload of each packet from a port."""
         self._listeners[port] = note
 
     # Sent at any time: these never wait for an answer.
 
     def send(self, packet: bytes) -> None:
-        """Send a packet. A link that is gone takes it silently: watch `lost`."""
+        """Send a packet; a lost link drops it silently, see `lost`."""
         if not self.lost:
             self._transport.send(packet)
 
     def fail(self, reason: str) -> None:
-        """Remember why the link is gone, if it stood."""
+        """Record why the link is lost, unless it already was."""
         self.lost = self.lost or (reason.splitlines() or ["no reason given"])[0]
 
     def _ping(self) -> float | None:
-        """Send a ping: the radio's own processor acknowledges packets by itself, the one that flies answers pings."""
+        """Send a ping. The radio processor acknowledges packets by itself; only the main processor answers pings."""
         if self.lost:
             return None
         self._pinged += 1
@@ -153,9 +153,9 @@ class Session:
     # For the ground only: these wait for an answer.
 
     def ask(self, port: Port, channel: int, payload: bytes, head: int, patience: float, what: str = "") -> bytes:
-        """Send until an answer comes that begins with the first `head` bytes of the payload, and return it.
+        """Send until an answer begins with the first `head` bytes of the payload, and return it.
 
-        Raises LinkError if none comes within `patience`, s, or if the link is lost meanwhile.
+        Raises LinkError if there is none within `patience`, s, or if the link is lost meanwhile.
         """
         request, clock, now = pack(port, channel, payload), self.clock, self.clock.now()
         end = now + patience
@@ -177,7 +177,7 @@ class Session:
         raise LinkError(f"no answer to {what or port.name.lower()}", where=self.uri, hint="check the radio link")
 
     def read_parameter(self, name: str, patience: float) -> float:
-        """Return the value of a parameter that the vehicle has, as of now. Raises LinkError if it does not answer."""
+        """Return the present value of an existing parameter. Raises LinkError if the vehicle does not answer."""
         number, kind = self.parameters[name]
         head = struct.pack("<H", number)
         answer = self.ask(Port.PARAMETERS, READ_PARAMETER, head, len(head), patience, f"reading {name}")
@@ -188,7 +188,7 @@ class Session:
                             hint="restart the vehicle") from error  # fmt: skip
 
     def write_parameter(self, name: str, value: float, patience: float) -> None:
-        """Write a parameter. Raises LinkError if the vehicle has none that can be set, or does not answer."""
+        """Write a parameter. Raises LinkError if the vehicle lacks it, it is read-only, or there is no answer."""
         number, kind = self.parameters.get(name, (-1, _READ_ONLY))
         layout = _LAYOUTS.get(kind & _TYPE_MASK)
         if kind & _READ_ONLY or layout is None:
@@ -219,11 +219,11 @@ class Session:
         for _ in range(_LOG_ATTEMPTS):
             if all(self._run_log_command(payload) for payload in block.creation()):
                 return block
-            self._run_log_command(bytes((DELETE, block.number)))  # a part of it may be there
+            self._run_log_command(bytes((DELETE, block.number)))  # it may exist in part
         raise LinkError("the vehicle does not create a log", where=self.uri, hint="check the radio link")
 
     def _run_log_command(self, payload: bytes) -> bool:
-        """Send a command of the log once; return whether the vehicle answers that it is done."""
+        """Send a log command once; return whether the vehicle confirms it."""
         try:
             answer = self.ask(Port.LOG, SETTINGS_CHANNEL, payload, 2, _RETRY_PERIOD)
         except LinkError:
@@ -233,7 +233,7 @@ class Session:
     def write_trajectory_memory(self, content: bytes) -> bytes:
         """Write the beginning of the trajectory memory, and return the same bytes as read back.
 
-        Raises LinkError if the vehicle has no such memory, or does not take or give all of it within 30 s.
+        Raises LinkError if the vehicle has no such memory, or does not write and read all of it within 30 s.
         """
         end = self.clock.now() + _UPLOAD_TIMEOUT
 

@@ -1,12 +1,12 @@
-"""Transports carry packets between a session and a vehicle: their protocol, and the transport by a driver of cflib."""
+"""Transports, which carry packets between a session and a vehicle: the protocol, and one over cflib's drivers."""
 
 import logging
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
-_LOOK_PERIOD = 0.1  # s, after which a thread that waits for a packet checks whether it must end
-_SEND_TIMEOUT = 0.1  # s that a packet waits for another thread's in a slow driver; then it is dropped
+_LOOK_PERIOD = 0.1  # s between checks of a receiving thread whether it must end
+_SEND_TIMEOUT = 0.1  # s to wait for another thread's packet in a slow driver; then the packet is dropped
 
 Hear = Callable[[bytes], None]
 Fail = Callable[[str], None]
@@ -14,22 +14,22 @@ _log = logging.getLogger(__name__)
 
 
 class Transport(Protocol):
-    """A link to one vehicle, open. Packets may be lost, repeated or late, but none overtakes another."""
+    """An open link to one vehicle. Packets may be lost, repeated or late, but stay in order."""
 
     def listen(self, hear: Hear, fail: Fail) -> None:
-        """Call `hear` with each packet that comes, and `fail` with the reason once the link is gone; called once."""
+        """Call `hear` with each packet, and `fail` with the reason once the link is lost; to be called once."""
 
     def send(self, packet: bytes) -> None:
-        """Send a packet within some milliseconds, or drop it; never wait for longer."""
+        """Send a packet within some milliseconds, or drop it."""
 
     def close(self) -> None:
         """End the link; may be called twice."""
 
 
 def start_receiver(receive: Callable[[float], bytes | None], hear: Hear, ended: threading.Event) -> None:
-    """Call `hear` in a thread with each packet that `receive` returns, until `ended`; `receive` takes its patience, s.
+    """Start a thread that calls `hear` with each packet from `receive`, until `ended`; `receive` takes a time-out, s.
 
-    An exception in `hear` is logged, and the next packet heard: no packet may end a link.
+    An exception in `hear` is logged, and reception continues: no packet may end a link.
     """
 
     def run() -> None:
@@ -45,14 +45,14 @@ def start_receiver(receive: Callable[[float], bytes | None], hear: Hear, ended: 
 
 
 class DriverTransport:
-    """A transport by one of cflib's link drivers."""
+    """A transport over one of cflib's link drivers."""
 
     def __init__(self, uri: str):
         """Connect. Raises ValueError if no driver knows the URI, and the errors of its driver."""
         from cflib import crtp
 
         self._fail: Fail = lambda _: None
-        self._failure = ""  # why the link is gone
+        self._failure = ""  # why the link is lost
         self._sending, self._ended = threading.Lock(), threading.Event()
         self._driver: Any = crtp.get_link_driver(uri, lambda _: None, self._failed)
         if self._driver is None:
@@ -83,19 +83,19 @@ class DriverTransport:
         return None if packet is None else bytes((packet.header, *packet.data))
 
     def _failed(self, reason: str) -> None:
-        """Note why the link is gone, and close it: some drivers report the same error over and over."""
+        """Record why the link is lost, and close it; some drivers report the same error repeatedly."""
         if not self._failure:
             self._failure = reason
             self._fail(reason)
-            threading.Thread(target=self.close, daemon=True).start()  # it waits for the thread that reports
+            threading.Thread(target=self.close, daemon=True).start()  # it waits for the reporting thread
 
 
 def register_drivers(drivers: Sequence[type]) -> None:
-    """Let cflib know these link drivers, to be tried before its own."""
+    """Register link drivers with cflib, ahead of its own."""
     from cflib import crtp
     from cflib.crtp.udpdriver import UdpDriver
 
-    if UdpDriver not in crtp.CLASSES:  # one of cflib's own; there may be others' already
+    if UdpDriver not in crtp.CLASSES:  # cflib's own are missing; there may already be others
         crtp.init_drivers()
     for driver in reversed(drivers):
         if driver not in crtp.CLASSES:

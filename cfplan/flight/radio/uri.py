@@ -1,4 +1,4 @@
-"""Check of a vehicle's URI: cflib accepts some that mean something else than they say."""
+"""Check of a vehicle's URI: cflib silently misreads some wrong ones."""
 
 import re
 

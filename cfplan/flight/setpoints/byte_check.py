@@ -1,8 +1,8 @@
-"""Byte check: certifies that the bytes of setpoints make the vehicle fly what was planned, and within the limits.
+"""Byte check: certifies that the bytes of setpoints make the vehicle fly the plan, within the limits.
 
-It begins with the decoded bytes and the trajectory, which is evaluated afresh, and uses no number that encoding
-computed. Where encoding turns attitudes by quaternions, this multiplies matrices; it shares with encoding only the
-controller's attitude, the push off obstacles, and the rates that hold the body against the air.
+It compares the decoded bytes with the trajectory, which is evaluated again, and uses no number that encoding computed.
+Encoding rotates attitudes by quaternions, this check by matrices; they share only the controller's attitude, the push
+away from obstacles, and the rates that compensate for the air's moment.
 
 For the names in formulas see rate_trade.py. With R the matrix of the attitude to fly, the wanted attitude is
 W = R exp(-τ ω) exp(φ); the controller must make it from the bytes, with the thrust of the motion along R's axis z.
@@ -76,9 +76,9 @@ _ROUNDING = 1e-9
 _ROUNDED = HALF_QUANTUM + _ROUNDING
 _LEAN_MAX = math.radians(75.0)  # the controller's heading is not defined at a tilt of 90°
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
-_TINY = 1e-12  # in place of lengths of 0
+_TINY = 1e-12  # replaces lengths of 0
 
-# What the errors of setpoints are called, in the order in which they are judged, and the most that each may be.
+# Names of the errors of setpoints, in the order of checking, with their tolerances.
 _ERRORS = (
     ("position in the packet is not that of the trajectory, off by", _ROUNDED),
     ("velocity in the packet is not that of the trajectory, off by", _ROUNDED),
@@ -93,9 +93,9 @@ _ERRORS = (
 def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: PlanLimits) -> None:
     """Certify the bytes of a flight against its trajectory.
 
-    What the controller makes of the decoded payloads lies within half a quantum of the trajectory at its time, the
-    attitude within what its bits allow; speed, acceleration, body rate, tilt and specific thrust of that motion are
-    within the limits and their quanta, and what is sent within bounds of its own; the last setpoint is a hover at the
+    What the controller reads from the payloads lies within half a quantum of the trajectory at its time, the
+    attitude within its resolution; speed, acceleration, body rate, tilt and specific thrust of that motion are within
+    the limits and their quanta, and the sent values within bounds of their own; the last setpoint is a hover at the
     end of the path. Raises NotCertifiedError with the setpoint at fault.
     """
     payloads = np.asarray(encoded.payloads)
@@ -112,9 +112,9 @@ def check_bytes(encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajector
 def check_setpoints(
     encoded: EncodedFlight, trajectory: Trajectory | JoinedTrajectory, limits: PlanLimits
 ) -> FullStateSetpoints:
-    """Certify as check_bytes() does each of the setpoints, which need not go on to the end of the trajectory.
+    """Certify setpoints like check_bytes(), without requiring that they reach the end of the trajectory.
 
-    Returns the motion that they make. Raises NotCertifiedError with the setpoint at fault.
+    Returns the resulting motion. Raises NotCertifiedError with the setpoint at fault.
     """
     times = encoded.times + LEAD
     planned = trajectory.at(times)
@@ -128,7 +128,7 @@ def check_setpoints(
     )
     ahead = trajectory.at(times + BRAKE_LEAD).acceleration
     flown = check_motion(np.asarray(encoded.payloads), motion, ahead, encoded.gains, space=encoded.space)
-    # What is sent makes up for drag besides, so the planned acceleration is judged, with the packet's error.
+    # The sent acceleration also compensates for drag, so the planned one is checked, with the packet's error.
     _check_limits(flown, planned.acceleration + flown.acceleration - motion.acceleration, limits)
     return flown
 
@@ -165,7 +165,7 @@ def check_motion(
     harmless = harmless_rates(asked, acceleration_ahead, gains, space)
     errors, acceleration, rate = _compared(arrays_of(sent), arrays_of(asked), harmless, gains.full_rate)
     for (what, most), error in zip(_ERRORS, errors, strict=True):
-        if not error.max() <= most:  # NaN is an error too
+        if not error.max() <= most:  # also if NaN
             row = int((~(error <= most)).argmax())
             raise _refused(what, float(error[row]), row)
     made = replace(sent, acceleration=acceleration, quaternion=asked.quaternion, body_rate=rate)
@@ -328,7 +328,7 @@ def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: Plan
     if not doubtful:
         return
     quantum, thrust, measured = np.sqrt(3) * HALF_QUANTUM + _ROUNDING, norms(force), measures_at_instants(*known)
-    lean = quantum / thrust  # an error turns the thrust vector so far
+    lean = quantum / thrust  # an error turns the thrust vector by this much
     for quantity in doubtful:
         value, limit = quantity.worst(measured), quantity.allowed(limits)
         rounding = {"rad": lean, "rad/s": quantum + FIRMWARE_GAINS.full_rate * lean}.get(quantity.unit, quantum)
@@ -339,7 +339,7 @@ def _check_limits(flown: FullStateSetpoints, acceleration: NDArray, limits: Plan
 
 
 def _require_hover(flown: FullStateSetpoints, trajectory: Trajectory | JoinedTrajectory) -> None:
-    """Check that the last setpoint, with which the vehicle is left if nothing more comes, is a hover at the end."""
+    """Check that the last setpoint, which stays in force if nothing follows, is a hover at the end."""
     moves = np.abs(np.stack([flown.acceleration[-1], flown.body_rate[-1]])).max()
     error = np.abs(flown.position[-1] - trajectory.at(np.array([trajectory.duration])).position[0]).max()
     if flown.velocity[-1].any() or not moves <= 4 * HALF_QUANTUM or not error <= _ROUNDED:

@@ -3,20 +3,20 @@
 Setpoints are numbered from the start of the stream. A proposal continues a commitment from a splice, the number of a
 setpoint ahead of the clock; the joint is the moment of the motion at which that setpoint was sampled.
 
-    before the joint   setpoints and their stops stay as they were committed, to the byte
-    at the joint       the proposal's first setpoint is the committed one, within a quantum, so nothing jumps
-    behind the joint   the setpoints and stops of the proposal replace all that was committed
+    before the joint   setpoints and their stops stay as committed, to the byte
+    at the joint       the proposal's first setpoint equals the committed one within a quantum, so nothing jumps
+    after the joint    the setpoints and stops of the proposal replace the committed ones
 
-The planner may be late, mistaken or broken, so the pilot verifies by the bytes alone that
+The planner may be late, mistaken or broken, so the pilot verifies from the bytes alone that
 
-- the bytes are those that were certified (checksum), and were made for just this commitment (order);
+- the bytes are the certified ones (checksum), and were made for this commitment (order);
 - the splice is still ahead of the clock (time), and not farther than a minute;
 - position, velocity, acceleration, attitude and body rates there are the committed ones within a quantum (joint);
 - the setpoints end at rest (end), and from each of them there is a stop that begins there and ends at rest (stops);
-- from setpoint to setpoint the vehicle moves as the velocities say (motion), inside the space (space), within the
-  limits of plans, and in stops within those of stops (limits).
+- positions agree with velocities from setpoint to setpoint (motion), inside the space (space), within the limits of
+  plans, and in stops within those of stops (limits).
 
-If anything of that fails, the old commitment is flown to its end. A commitment is a value: splicing makes a new one.
+If any check fails, the old commitment is flown to its end. A commitment is immutable: splicing makes a new one.
 """
 
 import struct
@@ -46,27 +46,27 @@ from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import rotations_of, yaw_of
 
-LEAST_AHEAD = 0  # setpoints from the one just sent to a splice, at least: the first that is another comes behind that
-FARTHEST_AHEAD = 6000  # setpoints from the clock to a splice, at most: a minute
-LONGEST_ENDING = 1000  # stops of a proposal that are not sent, at most, so that a message cannot ask for any memory
-KEPT_BEHIND = 100  # setpoints before the one due that are kept, for a vehicle that fell behind
+LEAST_AHEAD = 0  # least setpoints from the one just sent to a splice; the first new one follows the splice
+FARTHEST_AHEAD = 6000  # most setpoints from the clock to a splice: a minute
+LONGEST_ENDING = 1000  # most unsent stops of a proposal, which bounds the memory for it
+KEPT_BEHIND = 100  # setpoints kept before the one due, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
-LEVEL = 0.01  # rad of tilt, below which a vehicle hovers: twice what bytes round an attitude by
-LARGEST_JERK = 400.0  # m/s³, beyond which velocities do not belong together: ten times what plans reach
+LEVEL = 0.01  # rad, largest tilt in hover: twice the rounding of an attitude
+LARGEST_JERK = 400.0  # m/s³, between consistent velocities: ten times what plans reach
 _PERIOD = 1.0 / RATE
-# m between a position and the one that velocities give: the trapezoidal rule is off by the jerk times period³ / 12, and
-# packets are rounded.
+# m, between a position and the integral of velocities: the error of the trapezoidal rule, jerk times period³ / 12, plus
+# rounding.
 _JUMP = LARGEST_JERK * _PERIOD**3 / 12 + QUANTUM * (1.0 + _PERIOD)
 _ROUNDING = 1e-9
-_SAME_HEADING = 0.1  # rad; a stop trades other rates than its setpoint, which turns the heading by up to 0.02
+_SAME_HEADING = 0.1  # rad; a stop and its setpoint trade different rates, which differ in heading by up to 0.02
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
-# magic, what it follows, checksum, splice, setpoints, setpoints of a stop, stops that are sent, whether it goes on
+# magic, `follows`, checksum, splice, setpoints, setpoints per stop, stops sent, `goes_on`
 _HEAD = struct.Struct("<8sIIQIII?")
 
 
 class Fault(StrEnum):
-    """Why a proposal is refused."""
+    """Reasons to refuse a proposal."""
 
     SHAPE = "the proposal does not consist of setpoints with stops"
     CHECKSUM = "the proposal is not what was certified: its checksum differs"
@@ -83,7 +83,7 @@ class Fault(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a proposal is not flown; the commitment stays what it is."""
+    """Why a proposal is not flown; the commitment does not change."""
 
     fault: Fault
     detail: str  # the numbers
@@ -96,14 +96,14 @@ class Refusal:
 class Commitment:
     """Encoded setpoints that end at rest, with a stop from each.
 
-    Raises NotCertifiedError where the arrays are no setpoints with stops.
+    Raises NotCertifiedError if the arrays are not setpoints with stops.
     """
 
-    first: int  # number of the first setpoint that is kept
+    first: int  # number of the first kept setpoint
     payloads: NDArray  # (N, 29) uint8
     stops: NDArray  # (N, M, 29) uint8
-    splices: tuple[int, ...] = ()  # numbers of the setpoints from which plans made in the air are flown
-    checksum: int = -1  # of it and of all proposals that it was spliced from; -1: to be computed of the arrays
+    splices: tuple[int, ...] = ()  # numbers of the first setpoints of plans made in the air
+    checksum: int = -1  # of its whole history; -1: compute it from the arrays
 
     def __post_init__(self) -> None:
         if wrong := _wrong_shape(self.first, self.payloads, self.stops):
@@ -127,25 +127,25 @@ class Commitment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Proposal:
-    """What may replace the rest of a commitment from setpoint `splice` on."""
+    """A replacement for the rest of a commitment from setpoint `splice` on."""
 
     follows: int  # checksum of the commitment that it continues
     splice: int  # number of its first setpoint
     payloads: NDArray  # (K, 29) uint8
     stops: NDArray  # (K, M, 29) uint8
     checksum: int  # of splice, payloads and stops
-    ending: int = 0  # number of stops, the last ones, that are only the rest of the stop before them: see left_of()
-    goes_on: bool = False  # whether it is the next part of the plan that is being flown, which needs no message
+    ending: int = 0  # number of last stops that are the remainder of the stop before them, see left_of()
+    goes_on: bool = False  # whether it is the next part of the present plan, which is not announced
 
     def to_bytes(self) -> bytes:
-        """Return the proposal as a message to the pilot's process; copied memory costs milliseconds, so it is short."""
+        """Return the proposal as a message to the pilot's process, kept short as copying costs milliseconds."""
         sent = len(self.stops) - self.ending
         head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent, self.goes_on)
         return b"".join((head, self.payloads.tobytes(), self.stops[:sent].tobytes()))
 
     @classmethod
     def of_bytes(cls, message: bytes) -> "Proposal | None":
-        """Return the proposal of a message, or None if it is none. What it proposes is not verified."""
+        """Return the proposal in a message, unverified; None if there is none."""
         if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
             return None
         _, follows, checksum, first, count, length, sent, goes_on = _HEAD.unpack_from(message)
@@ -169,17 +169,17 @@ def propose(
     *,
     goes_on: bool = False,
 ) -> Proposal:
-    """Return the proposal of setpoints and stops that were certified to continue the commitment from `splice` on.
+    """Return a proposal of certified setpoints and stops that continue the commitment from `splice` on.
 
-    `ending` is the number of stops, the last ones, that are only the rest of the stop before them. With `goes_on`, the
-    proposal is the next part of the plan that is being flown.
+    `ending` is the number of last stops that are the remainder of the stop before them; `goes_on` marks the next part
+    of the present plan.
     """
     checksum = checksum_of(splice, payloads, stops)
     return Proposal(commitment.checksum, splice, payloads, stops, checksum, ending, goes_on)
 
 
 def left_of(stop: NDArray, count: int) -> NDArray:
-    """Return (count, M, 29) uint8: the stops from within a stop, (M, 29), and the hover behind it, are its rest."""
+    """Return the stops from within a stop, (M, 29), and from the hover after it, (count, M, 29): its remainders."""
     padded = np.concatenate([stop[1:], np.repeat(stop[-1:], count, axis=0)])
     return np.asarray(sliding_window_view(padded, len(stop), axis=0)[:count].swapaxes(1, 2))
 
@@ -193,9 +193,9 @@ def checksum_of(first: int, payloads: NDArray, stops: NDArray) -> int:
 
 
 def splice(commitment: Commitment, proposal: Proposal, now: int, limits: Limits) -> Commitment | Refusal:
-    """Return what is committed with the proposal, or why it is refused; `now` is the number of the setpoint due.
+    """Return the new commitment, or why the proposal is refused; `now` is the number of the setpoint due.
 
-    Never raises, whatever the proposal holds.
+    Never raises, whatever the proposal contains.
     """
     if not isinstance(proposal, Proposal) or _wrong_shape(proposal.splice, proposal.payloads, proposal.stops):
         return Refusal(Fault.SHAPE, "")
@@ -226,13 +226,13 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, limits: Limits)
 
 
 def spliced(commitment: Commitment, proposal: Proposal, now: int) -> Commitment:
-    """Return what is committed with a proposal that the pilot accepts, as splice() does, but without verifying it."""
+    """Return the new commitment as splice() does, without verifying the proposal."""
     first = max(min(proposal.splice, now) - KEPT_BEHIND, commitment.first)
     behind = np.minimum(np.arange(first, proposal.splice), commitment.last) - commitment.first
     payloads = np.concatenate([commitment.payloads[behind], proposal.payloads])
     stops = np.concatenate([commitment.stops[behind], proposal.stops])
     for array in (payloads, stops):
-        array.setflags(write=False)  # so they are kept as they are, not copied again
+        array.setflags(write=False)  # so they need not be copied
     return Commitment(
         first,
         payloads,
@@ -250,7 +250,7 @@ def _frozen(array: NDArray) -> NDArray:
 
 
 def _wrong_shape(first: int, payloads: NDArray, stops: NDArray) -> str:
-    """Return what is wrong with setpoints and stops, empty where nothing is."""
+    """Return what is wrong with the shapes of setpoints and stops; empty if nothing is."""
     if not isinstance(first, int) or first < 0:
         return f"the first setpoint has the number {first!r}"
     for name, array, shape in (("setpoints", payloads, (PAYLOAD_SIZE,)), ("stops", stops, (-1, PAYLOAD_SIZE))):
@@ -283,7 +283,7 @@ def _moves_at_end(proposal: Proposal) -> Refusal | None:
 
 
 def _find_fault(proposal: Proposal, before: NDArray, limits: Limits) -> Refusal | None:
-    """Return why the setpoints must not be flown; the stop at their end is judged with the other stops."""
+    """Return why the setpoints must not be flown; the stop at their end is checked with the other stops."""
     end = max(len(proposal.payloads) - (proposal.ending + 1 if proposal.ending else 0), 1)
     if found := _first_excess(proposal.payloads[None], before, end, limits, in_stop=False):
         fault, what, _, row = found
@@ -338,7 +338,7 @@ def _first_excess(
 
 def _excess_text(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_stop: bool) -> tuple[Fault, str] | None:
     """Return kind and text of the fault in runs of setpoints, by their worst values; None if there is no fault."""
-    # Stops lie on the chords between setpoints, where each position is off by acceleration times period² / 8 at most.
+    # Stops start on the chords between setpoints, off the path by at most acceleration times period² / 8.
     chords = limits.flight.acceleration.brake * _PERIOD**2 / 4 if in_stop else 0.0
     if not worst.jump <= _JUMP + chords:
         return Fault.MOTION, f"jumps by {worst.jump:.3f} m"
@@ -352,7 +352,7 @@ def _excess_text(worst: MotionExtremes, runs: NDArray, limits: Limits, *, in_sto
 
 
 def _rests(setpoints: FullStateSetpoints) -> NDArray:
-    """Return (N,) whether each setpoint makes the vehicle hover: turned back by what its rates ask for, it is level."""
+    """Return (N,) whether each setpoint is a hover: level once the turn for its traded rates is removed."""
     force = setpoints.acceleration + np.array([0.0, 0.0, GRAVITY])
     turn = rotations_of(turns_for(-setpoints.body_rate[:, :2]))
     axis = (controller_attitude(force, setpoints.quaternion) @ np.swapaxes(turn, 1, 2))[:, :, 2]

@@ -1,8 +1,8 @@
 """Descents as setpoints: landings, gentle with poses and quick without, and stops that also sink.
 
-A descent continues beneath the floor. A vehicle that stands on the floor, whose height is only roughly known, no longer
-follows its setpoints down: so the pilot detects that it stands. Roll and pitch rates are small; if setpoints stop, the
-vehicle levels out, leans away from a wall nearby, and comes down where it is.
+A descent continues below the floor, whose height is only roughly known. A standing vehicle no longer follows its
+setpoints down, which is how the pilot detects it. Roll and pitch rates are small; if setpoints stop, the vehicle levels
+out, leans away from a nearby wall, and comes down where it is.
 
 Without poses the vehicle drifts, so as it sinks it also moves away from the walls nearby. That must be over before it
 touches the floor, where sideways motion would tip it over, so it moves only as far as its time allows.
@@ -23,16 +23,16 @@ from cfplan.safety.space import SIDES, Space, inside
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import about_z, quaternions_of
 
-_CRUISE = 1.5  # times the mean speed of landing: what a descent sinks at between its ends
+_CRUISE = 1.5  # sink rate between the ends of a descent, as a multiple of the mean landing speed
 _QUICK_ACCELERATION = 3.0  # m/s²: thrust stays above half of gravity, below which a vehicle counts as tumbling
-# m above the floor, and m/s²: below that, a vehicle that has just braked sinks on more gently. Its controller asks for
-# less thrust than the setpoint does; with 3 m/s² it stopped all motors, and without thrust the vehicle turned by 40°.
+# m above the floor, and m/s² below that height, for a vehicle that has just braked: its controller commands less thrust
+# than the setpoint has. With 3 m/s² it stopped all motors, and without thrust the vehicle tilted by 40°.
 _GENTLE_BELOW, _GENTLE_ACCELERATION = 0.6, 1.0
-_WALL_DISTANCE = 1.0  # m from a wall, nearer than which a vehicle without poses goes off it
-_ASIDE_MAX = 0.4  # m that it goes along x or y for that in one stop or descent
+_WALL_DISTANCE = 1.0  # m; a vehicle without poses moves away from walls that are nearer
+_ASIDE_MAX = 0.4  # m, along x or y, in one stop or descent
 _ASIDE_ACCELERATION = 1.5  # m/s², of a descent sideways: a tilt of 9°
 _STOP_ASIDE_ACCELERATION = 3.0  # m/s², of a stop's setpoints, which the vehicle does not follow as fast
-_BY_SMOOTHSTEP = 10.0 / math.sqrt(3.0)  # acceleration of a quintic smoothstep, for a way of 1 m in 1 s
+_BY_SMOOTHSTEP = 10.0 / math.sqrt(3.0)  # peak acceleration of a quintic smoothstep over 1 m in 1 s
 _MIN_HEIGHT_ASIDE = 0.1  # m above the floor, below which a descent only sinks
 
 _Sideways = tuple[NDArray, NDArray, NDArray]
@@ -44,8 +44,8 @@ class Pace:
 
     speed: float  # m/s, at most
     acceleration: float  # m/s²
-    touch_speed: float  # m/s, with which it meets the floor and goes on beneath it
-    slow_above: float  # m above the floor at which it has slowed to that
+    touch_speed: float  # m/s, at the floor and below it
+    slow_above: float  # m above the floor, where it has slowed to that
 
     def at(self, height: float) -> float:
         """Return the speed, m/s, at a height above the floor, m."""
@@ -58,7 +58,7 @@ def gentle(mean_speed: float) -> Pace:
     return Pace(_CRUISE * mean_speed, acceleration=0.8, touch_speed=0.1, slow_above=0.05)
 
 
-# Without poses: as fast as what falls from 0.2 m, and where the floor may be, as what falls from 2 cm.
+# Without poses: as fast as after a fall from 0.2 m, and near the floor as after a fall from 2 cm.
 QUICK = Pace(2.0, acceleration=_QUICK_ACCELERATION, touch_speed=0.6, slow_above=0.1)
 
 
@@ -69,7 +69,7 @@ def descent(
     pace: Pace,
     floor: float,
     lowest: float,
-    *,  # beside the motion itself: what it is flown by
+    *,  # limits, rate and sideways displacement
     limits: Limits,
     rate: float,
     aside: tuple[float, float] = (0.0, 0.0),
@@ -77,7 +77,7 @@ def descent(
     """Return payloads, (N, 29) uint8 at `rate`, Hz, down from `begin`, m, to the height `lowest`, m.
 
     It sinks at `speed_now`, m/s, first, then at the pace for a floor at the height `floor`, m. The last row rests.
-    Meanwhile it goes `aside`, x and y in m, or less far where it would reach the floor before.
+    Meanwhile it moves `aside`, x and y in m, or less if it would reach the floor first.
     """
     heights, speeds = [begin[2]], [max(speed_now, 0.0)]
     while heights[-1] > lowest:
@@ -103,13 +103,13 @@ def descent(
 
 
 def off_walls(position: Triple, space: Space) -> tuple[float, float]:
-    """Return the way, x and y in m, that leads a vehicle at a position, m, off the walls nearby; not at an obstacle."""
+    """Return the displacement, x and y in m, away from nearby walls, or zero if an obstacle is there."""
     x, y = (
         min(max(_away_from_walls(place, low, high) - place, -_ASIDE_MAX), _ASIDE_MAX)
         for place, low, high in zip(position[:2], space.low[:2], space.high[:2], strict=True)
     )
     height = max(position[2] - space.low[2], 0.0)
-    half = np.array([abs(x), abs(y), height]) / 2  # of the box that holds the way as it sinks
+    half = np.array([abs(x), abs(y), height]) / 2  # of the box around the descent
     middle = (position[0] + x / 2, position[1] + y / 2, space.low[2] + height / 2)
     return (x, y) if inside(space.beyond(middle, half)[SIDES:]).all() else (0.0, 0.0)
 
@@ -121,9 +121,9 @@ def _away_from_walls(place: float, low: float, high: float) -> float:
 
 
 def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, acceleration: float) -> _Sideways:
-    """Return place, m, speed, m/s, and acceleration, m/s², (N, 2) each, of a way that is over `within` so many rows.
+    """Return position, m, velocity, m/s, and acceleration, m/s², (N, 2) each, of a displacement in `within` rows.
 
-    It is as much of the way `aside`, m, as can be gone with that `acceleration`, m/s², at most.
+    It covers as much of `aside`, m, as `acceleration`, m/s², permits.
     """
     duration, length = max(within, 1) / rate, math.hypot(*aside)
     reach = acceleration * duration**2 / _BY_SMOOTHSTEP if within else 0.0
@@ -137,10 +137,10 @@ def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, 
 
 
 def sinking(payloads: NDArray, lowest: float, speed: float, rate: float, space: Space) -> NDArray:
-    """Return the motion of `payloads`, (N, 29) uint8 at `rate`, Hz, sinking besides, at `speed`, m/s, at most.
+    """Return the motion of `payloads`, (N, 29) uint8 at `rate`, Hz, that also sinks, at most at `speed`, m/s.
 
-    It sinks to the height `lowest`, m, at most, and not at all where the motion is that low anyway; and it goes off the
-    walls near which it would end. Only position and velocity change, so it is feedback that moves the vehicle.
+    It sinks no lower than the height `lowest`, m, and not at all if the motion is that low already; and it moves away
+    from the walls near its end. Only position and velocity change, so it is feedback that moves the vehicle.
     """
     motion = decode(payloads)
     room = max(float(motion.position[:, 2].min()) - lowest, 0.0)

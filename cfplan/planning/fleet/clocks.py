@@ -1,9 +1,9 @@
-"""The fastest clock of one vehicle among others whose flights are known: when it starts, and how fast its clock runs.
+"""The fastest clock of one vehicle among others with known flights: its start delay, and its clock rate.
 
-The vehicle stays on its path. With t the time of all and u that of its own plan, a clock is a curve u(t) whose slope is
-between 0 and 1, and which keeps out of the conflict map: the pairs (t, u) at which the vehicle is too near to another.
-Curves are searched on a grid: a rate is one of LEVELS quarters, changes by one quarter in RAMP ticks, and is 0 only at
-the start. Of the curves that end soonest, the one that is found waits as early as it can, at the start if possible.
+The vehicle stays on its path. With the common time t and the time u of its own plan, a clock is a curve u(t) with a
+slope between 0 and 1 that avoids the conflict map: the pairs (t, u) at which the vehicle is too near to another. Curves
+are searched on a grid: rates are multiples of a quarter, change by one quarter in RAMP ticks, and are 0 only at the
+start. Of the curves with the earliest end, the result waits as early as possible, preferably at the start.
 """
 
 from typing import NamedTuple
@@ -13,11 +13,16 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 
-TICK = 0.04  # s of the time of all, a multiple of the period of setpoints
+TICK = 0.04  # s of common time, a multiple of the setpoint period
 LEVELS = 4  # rates above 0
 CELL = TICK / LEVELS  # s of a plan's own time
-RAMP = 6  # ticks from one rate to the next: 1.04 /s, which from 2 m/s brakes by 2.1 m/s²
-_START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8  # how a state is reached: from rest, at the same, a lower, a higher rate
+RAMP = 6  # ticks between rates: 1.04 /s, which from 2 m/s brakes at 2.1 m/s²
+_START, _SAME, _SLOWER, _FASTER = (
+    1,
+    2,
+    4,
+    8,
+)  # how a state was reached: from rest, at the same, a lower, or a higher rate
 
 
 class VehicleClock(NamedTuple):
@@ -28,12 +33,12 @@ class VehicleClock(NamedTuple):
 
     @property
     def delay(self) -> float:
-        """Return how long it waits at its start, s."""
+        """Return the start delay, s."""
         return TICK * float(np.argmax(self.rate > 0.0))
 
     @property
     def slows(self) -> bool:
-        """Return whether it is slowed on its way."""
+        """Return whether the clock slows after the start."""
         return bool((self.rate[self.rate > 0.0] < 1.0).any())
 
     def rate_at(self, own: NDArray) -> NDArray:
@@ -43,25 +48,28 @@ class VehicleClock(NamedTuple):
 
 
 class Stuck(NamedTuple):
-    """No clock leads to the end: how far the vehicle gets at most, and when."""
+    """No clock reaches the end: the farthest point that the vehicle reaches, and when."""
 
     own: float  # s of its plan's own time
     time: float  # s
 
 
 def cells_of(duration: float) -> NDArray:
-    """Return the own times, s, of a plan's cells, with as many behind its end as one tick passes."""
+    """Return the own times, s, of a plan's cells, extended past its end by the cells of one tick."""
     return CELL * np.arange(int(np.ceil(duration / CELL)) + LEVELS)
 
 
-def fastest_clock(own: NDArray, others: NDArray, apart: float) -> VehicleClock | Stuck:
-    """Return the clock that reaches the end soonest, `apart`, m, from all others.
+def fastest_clock(
+    own: NDArray, others: NDArray, apart: float, hazard: NDArray, may_start: NDArray
+) -> VehicleClock | Stuck:
+    """Return the clock with the earliest end, `apart`, m, from all others.
 
     `own`, (U, 2) m, are x and y of the vehicle at each of cells_of() its plan; `others`, (K, T, W, 2) m, are those of K
-    vehicles whose flights are known, at W moments of the skew about each tick until all rest.
+    vehicles whose flights are known, at W moments of the skew about each tick until all rest. It also keeps out of
+    `hazard`, (T, U) bool, and does not start at ticks other than those in `may_start`, (T,) bool.
     """
-    conflict = _conflicts(own, others, apart)
-    how, end, cell, level = _reached(conflict)
+    conflict = _conflicts(own, others, apart) | hazard
+    how, end, cell, level = _reached(conflict, may_start)
     if level > 0:
         return VehicleClock(*_followed(how, end, cell, level))
     found = how.any(axis=2)
@@ -83,10 +91,10 @@ def _conflicts(own: NDArray, columns: NDArray, apart: float) -> NDArray:
 
 
 @njit(nogil=True, error_model="numpy")
-def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
-    """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the soonest end.
+def _reached(conflict: NDArray, may_start: NDArray) -> tuple[NDArray, int, int, int]:
+    """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the earliest end.
 
-    The level is 0 where no end is reached.
+    The level is 0 if no end is reached.
     """
     known, cells = conflict.shape
     end = cells - LEVELS  # the first cell at the end
@@ -97,7 +105,7 @@ def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
         stays[t] = stays[t + 1] and _free(conflict, t, end)
     for t in range(ticks):
         if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, t, 0):
-            for level in range(LEVELS + 1):
+            for level in range(LEVELS + 1 if may_start[min(t, known - 1)] else 1):
                 how[t, 0, level] |= _START
         for u in range(cells):
             for level in range(LEVELS, 0, -1):
@@ -117,7 +125,7 @@ def _reached(conflict: NDArray) -> tuple[NDArray, int, int, int]:
 
 @njit(error_model="numpy")
 def _ramp(how: NDArray, conflict: NDArray, t: int, u: int, level: int, change: int) -> None:
-    """Reach the state behind a change of rate from a state, unless it is in conflict on the way."""
+    """Mark the state after a change of rate as reached, unless there is a conflict on the way."""
     for k in range(1, RAMP + 1):
         if not _free(conflict, t + k, u + _passed(level, change, k)):
             return
@@ -132,13 +140,13 @@ def _passed(level: int, change: int, ticks: int) -> int:
 
 @njit(error_model="numpy")
 def _free(conflict: NDArray, t: int, u: int) -> bool:
-    """Return whether a state is out of conflict; behind the last tick of the map all others rest."""
+    """Return whether a state is out of conflict; after the last tick of the map all others rest."""
     return not conflict[min(t, len(conflict) - 1), u]
 
 
 @njit(error_model="numpy")
 def _followed(how: NDArray, t: int, u: int, level: int) -> tuple[NDArray, NDArray]:
-    """Return cells and rates at each tick up to an end, of the clock that waits as early as it can."""
+    """Return cells and rates at each tick up to an end, of the clock that waits as early as possible."""
     own, rate = np.zeros(t + 1, dtype=np.int64), np.zeros(t + 1)
     own[t], rate[t] = u, level / LEVELS
     while u > 0:

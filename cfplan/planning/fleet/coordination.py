@@ -1,9 +1,9 @@
-"""Coordinate a fleet: start delays and clock rates with which certified plans keep apart on their own paths.
+"""Coordinate a fleet: start delays and clock rates with which certified plans keep their distance on their own paths.
 
-One vehicle after another gets the fastest clock among those before it. Which order is best is not known, so several are
-tried: the longest flight first; then with the one that was stuck, or that ended last, moved to the front; then others.
-A clock that only waits at the start is exact. One that slows on the way becomes speed caps, under which the path is
-planned again, so that all limits hold; what comes of it is measured against the others, not assumed.
+Vehicles get the fastest clock one after another, each among those before it. The best order is unknown, so several are
+tried: the longest flight first; then with the vehicle that was stuck, or ended last, moved to the front; then others.
+A clock that only waits at the start is exact. One that slows later becomes speed caps, under which the path is planned
+again, so that all limits hold; the result is compared with the other flights again.
 """
 
 import itertools
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.random_paths import generator
 from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_of, fastest_clock
+from cfplan.planning.fleet.hazards import Hazards
+from cfplan.planning.fleet.lost import Loss, LossModel
 from cfplan.planning.fleet.members import FleetMember, places
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
@@ -24,18 +26,18 @@ from cfplan.planning.repair import under_caps
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.trajectory import Trajectory
 
-ORDERS, TRIALS = 24, 6  # tried roughly, and of these made, the fastest first
-SLACKS = (0.02, 0.05, 0.1)  # m added to the distance that a search keeps, tried until the certificate passes
-_BETWEEN_SKEWS = 0.03  # s, at most, between the moments of the skew at which a search compares
+ORDERS, TRIALS = 24, 6  # orders that are sketched; of these the fastest are planned
+SLACKS = (0.02, 0.05, 0.1)  # m added to the distance in the search, tried until the certificate passes
+_BETWEEN_SKEWS = 0.03  # s, largest spacing within the skew in the search
 _LEAST_SPEED = 0.05  # m/s, of caps
-_PLACES = 0.02  # s of a plan from one place of its caps to the next
+_PLACES = 0.02  # s of a plan between the places of its caps
 
 
-Finish = Callable[[Plan], Plan]  # makes what was planned again ready to fly; raises InfeasibleError
+Finish = Callable[[Plan], Plan]  # finishes a plan that was made again; raises InfeasibleError
 
 
 class Blocked(NamedTuple):
-    """Why no order was found: where one vehicle gets no farther for another."""
+    """Why no order was found: where one vehicle is blocked by another."""
 
     pair: tuple[str, str]
     place: tuple[float, float]  # m, x and y, of the first
@@ -49,12 +51,12 @@ class Blocked(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Track:
-    """A flight among which a clock is sought."""
+    """A flight that a clock must avoid."""
 
     number: int
     base: Trajectory  # the plan before coordination
-    clock: VehicleClock | None  # its clock, as sketched
-    member: FleetMember | None = None  # the flight, as made
+    clock: VehicleClock | None  # its sketched clock
+    member: FleetMember | None = None  # the planned flight
 
     @property
     def end(self) -> float:
@@ -63,8 +65,15 @@ class _Track:
         assert self.clock is not None
         return TICK * (len(self.clock.own) - 1)
 
+    @property
+    def delay(self) -> float:
+        if self.member is not None:
+            return self.member.delay
+        assert self.clock is not None
+        return self.clock.delay
+
     def own(self, times: NDArray) -> NDArray:
-        """Return the own time of the plan before coordination at times of all, s."""
+        """Return the own time of the plan before coordination at common times, s."""
         if self.member is not None:
             made = self.member.plan.trajectory
             return self.base.time_at(made.s_at((times - self.member.delay).ravel())).reshape(times.shape)
@@ -72,18 +81,20 @@ class _Track:
         return np.asarray(np.interp(times, TICK * np.arange(len(self.clock.own)), CELL * self.clock.own))
 
     def columns(self, times: NDArray) -> NDArray:
-        """Return x and y at times of all, (..., 2) m."""
+        """Return x and y at common times, (..., 2) m."""
         return places(self.base, self.own(times).ravel()).reshape(*times.shape, 2)
 
 
 def coordinate(
-    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish
+    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish, lost: LossModel | None = None
 ) -> tuple[FleetMember, ...] | Blocked:
     """Return the members with delays and slower plans, whose columns stay `apart`, m, for clocks `skew`, s, apart.
 
-    `finish` is applied to each plan that is made slower, before it is compared with others.
+    `finish` is applied to each slower plan before it is compared with others. With a model of lost vehicles, the others
+    also keep away from these.
     """
-    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish)
+    hazards = None if lost is None else Hazards.of(members, lost, skew)
+    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish, lost, hazards)
     found: list[tuple[float, tuple[int, ...]]] = []
     blocked: Blocked | None = None
     longest = max(member.plan.trajectory.duration for member in members)
@@ -133,13 +144,15 @@ class _Orders:
 
 @dataclass(frozen=True, slots=True)
 class _Search:
-    """Members, what they must keep, and the search for their clocks in one order."""
+    """Search for the clocks of members in one order, with the distances that they must keep."""
 
     members: tuple[FleetMember, ...]
     apart: float  # m
     skew: float  # s
-    at_rest: float  # m, from start to start and from end to end, which no clock changes
+    at_rest: float  # m, between starts and between ends, which no clock changes
     finish: Finish
+    lost: LossModel | None = None
+    hazards: Hazards | None = None
 
     def sketch(self, order: tuple[int, ...]) -> list[_Track] | Blocked:
         """Return clocks in an order, without planning again."""
@@ -152,14 +165,16 @@ class _Search:
         return tracks
 
     def make(self, order: tuple[int, ...]) -> tuple[FleetMember, ...] | Blocked:
-        """Return the members with the clocks of an order, each planned again where it is slowed."""
+        """Return the members with the clocks of an order, each planned again if it is slowed."""
         tracks: list[_Track] = []
         for number in order:
             made = self._track(number, tracks)
             if isinstance(made, Blocked):
                 return made
             tracks.append(made)
-        return tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+        members = tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
+        nearest = self._nearest_loss(members, range(len(members)))
+        return members if nearest is None else _blocked_by(nearest)
 
     def _track(self, number: int, tracks: list[_Track]) -> _Track | Blocked:
         """Return the flight of a vehicle that keeps apart from the tracks of others."""
@@ -171,14 +186,21 @@ class _Search:
                 return blocked or clock
             try:
                 made = _with_clock(member, clock, self.apart, self.finish)
-            except InfeasibleError:  # too slow for a profile, or what slowing does not make safe
+            except InfeasibleError:  # too slow for a profile, or not safe at any speed
                 slows = int(np.argmax((clock.rate > 0.0) & (clock.rate < 1.0)))
                 blocked = self._blocked(number, Stuck(CELL * float(clock.own[slows]), TICK * slows), tracks)
                 continue
             nearest = _nearest(made, tracks, self.skew)
-            if nearest is None or nearest.keeps(self.apart):
+            if nearest is not None and not nearest.keeps(self.apart):
+                blocked = _blocked_by(nearest)
+                continue
+            near = [
+                self._nearest_loss((made, track.member), (number, track.number)) for track in tracks if track.member
+            ]
+            lost = min((each for each in near if each), key=lambda each: each.distance, default=None)
+            if lost is None:
                 return _Track(number, member.plan.trajectory, None, made)
-            blocked = Blocked(nearest.pair, nearest.place, nearest.time)
+            blocked = _blocked_by(lost)
         assert blocked is not None
         return blocked
 
@@ -193,11 +215,24 @@ class _Search:
         others = np.zeros((len(tracks), len(ticks), len(band), 2))
         for row, track in zip(others, tracks, strict=True):
             row[:] = track.columns(ticks[:, None] + band)
-        clock = fastest_clock(own, others, min(self.apart + slack, max(self.at_rest, self.apart)))
+        hazard, may_start = np.zeros((len(ticks), len(own)), dtype=np.bool_), np.ones(len(ticks), dtype=np.bool_)
+        if self.hazards is not None:
+            for track in tracks:
+                times = np.where(ticks < track.delay, ticks - track.delay, track.own(ticks))
+                self.hazards.mark(hazard, may_start, (number, track.number), times, slack)
+        keeps = min(self.apart + slack, max(self.at_rest, self.apart))
+        clock = fastest_clock(own, others, keeps, hazard, may_start)
         return clock if isinstance(clock, VehicleClock) else self._blocked(number, clock, tracks)
 
+    def _nearest_loss(self, members: Sequence[FleetMember], numbers: Sequence[int]) -> Loss | None:
+        """Return the lost vehicle that comes nearest to another, if it comes too near."""
+        if self.lost is None:
+            return None
+        nearest = self.lost.losses(members, numbers, self.skew)[0]
+        return None if nearest.keeps(self.lost.clearance) else nearest
+
     def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
-        """Return where a vehicle is stuck, and which of the others is nearest to where it would go."""
+        """Return where a vehicle is stuck, and the other vehicle that is nearest to its next position."""
         trajectory = self.members[number].plan.trajectory
         (x, y), ahead = places(trajectory, np.array([stuck.own, stuck.own + TICK])).tolist()
         then = np.array([stuck.time])
@@ -211,14 +246,19 @@ def _distance_at_rest(members: Sequence[FleetMember]) -> float:
     return min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(ends, 2)), default=np.inf)
 
 
+def _blocked_by(near: Separation | Loss) -> Blocked:
+    """Return which pair comes too near, as the reason why a vehicle gets no farther."""
+    return Blocked(near.pair, near.place, near.time)
+
+
 def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation | None:
-    """Return the nearest approach to the tracks of others; None where there are none."""
+    """Return the nearest approach to the tracks of others; None if there are none."""
     found = [separations((made, track.member), skew)[0] for track in tracks if track.member]
     return min(found, key=lambda each: each.distance, default=None)
 
 
 def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:
-    """Return the member with a clock, planned again where that is slow. Raises InfeasibleError."""
+    """Return the member with a clock, planned again if the clock slows. Raises InfeasibleError."""
     if not clock.slows:
         return replace(member, delay=clock.delay)
     plan = member.plan

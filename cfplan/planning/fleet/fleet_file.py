@@ -1,7 +1,8 @@
-"""Fleet files: vehicles by name, each with its path, and the distance that they keep from each other.
+"""Fleet files: vehicles by name with their paths, and the distance to keep between them.
 
 apart: 0.30          # m between the vertical columns of any two vehicles
 skew: 0.03           # s by which their clocks may differ
+lost: refuse         # a fleet in which a lost vehicle may come too near to another; warn: plan it all the same
 vehicles:
   left: {path: ../circle.yaml, place: {x: -1.0}}
   right: {path: ../line.yaml, place: {x: 1.0, yaw_deg: 90}, uri: radio://0/80/2M/E7E7E7E702, body: cf2}
@@ -9,8 +10,10 @@ vehicles:
 
 import itertools
 import pathlib
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -42,7 +45,15 @@ class FleetFile:
     name: str
     vehicles: tuple[FleetVehicle, ...]
     apart: float  # m, at least, between the vertical columns of any two vehicles
-    skew: float  # s, at most, by which clocks and orders to stop differ
+    skew: float  # s, largest difference between clocks, and between the arrivals of an order to stop
+    lost_only_warns: bool = False  # of a lost vehicle that may come too near to another; else the fleet is refused
+
+    @property
+    def dongles(self) -> dict[str, tuple[int, ...]]:
+        """Return the numbers of the vehicles of each dongle that two or more share, by the dongle's name."""
+        names = [_dongle(vehicle.uri) for vehicle in self.vehicles]
+        shared = {name: tuple(n for n, each in enumerate(names) if each == name) for name in names if name}
+        return {name: numbers for name, numbers in shared.items() if len(numbers) > 1}
 
 
 class _Vehicle(BaseModel):
@@ -60,6 +71,7 @@ class _Content(BaseModel):
     name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
     apart: float = Field(default=APART, ge=0.2, le=5.0)
     skew: float = Field(default=SKEW, ge=0.0, le=0.2)
+    lost: Literal["refuse", "warn"] = "refuse"
     vehicles: dict[str, _Vehicle]
 
 
@@ -88,10 +100,16 @@ def load_fleet_file(file: pathlib.Path) -> FleetFile:
             hint="a single vehicle flies a path file" if len(content.vehicles) < FEWEST else "leave some out",
         )
     vehicles = tuple(_vehicles(content, file.parent, places))
-    fleet = FleetFile(content.name or file.stem, vehicles, content.apart, content.skew)
+    fleet = FleetFile(content.name or file.stem, vehicles, content.apart, content.skew, content.lost == "warn")
     for a, b in itertools.combinations(vehicles, 2):
         _check_pair(a, b, fleet, places)
     return fleet
+
+
+def _dongle(uri: str) -> str:
+    """Return the name of the dongle in an address, as 0 in radio://0/80/2M; empty where there is none."""
+    found = re.match(r"radio://([^/]+)", uri)
+    return found[1] if found else ""
 
 
 def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterator[FleetVehicle]:
@@ -113,7 +131,7 @@ def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterat
 
 
 def _check_pair(a: FleetVehicle, b: FleetVehicle, fleet: FleetFile, places: Places) -> None:
-    """Raise InputError if two vehicles cannot be told apart, or cannot stand beside each other."""
+    """Raise InputError if two vehicles cannot be distinguished, or stand too close to each other."""
     for key in ("uri", "body"):
         if getattr(a, key) and getattr(a, key) == getattr(b, key):
             raise InputError(

@@ -1,4 +1,4 @@
-"""A vehicle of a fleet: its certified plan, begun at its time on the clock that all vehicles share."""
+"""A vehicle of a fleet: its certified plan, and its start on the common clock."""
 
 from dataclasses import dataclass
 

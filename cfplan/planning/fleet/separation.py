@@ -1,17 +1,17 @@
-"""The certificate of separation: how near the vertical columns of two vehicles come to each other.
+"""Separation certificate: the least distance between the vertical columns of two vehicles.
 
-Vehicles keep apart sideways at all heights, since the air beneath one pushes another down, and so that all can come
-straight down from wherever they stop. Take-off, the way up to the start, waiting, landing and standing all happen in
-the columns of start and end, so the distance of columns over time is that of all phases.
+Vehicles keep a horizontal distance at all heights, because the downwash of one pushes another down, and because each
+must be able to descend vertically from wherever it stops. Take-off, the way up to the start, waiting, landing and
+standing are all in the columns of start and end, so the distance between columns over time covers all phases.
 
-The clocks of two vehicles differ by the skew at most, so every moment of one is compared with every moment of the other
-within the skew. Between samples a vehicle moves no faster than its certified plan may, which is taken off.
+The clocks of two vehicles differ by at most the skew, so each moment of one is compared with all moments of the other
+within the skew. The distance that a vehicle may move between samples, at its certified speed, is subtracted.
 
-Joint stops need no samples of their own: each stop runs along the path by the same law of its clock, so vehicles that
-all brake at one tick pass pairs of places that are compared here, and rest at such a pair. The order to brake may reach
-them at different times, which adds to the skew.
+Joint stops need no samples of their own: each stop slows the clock along the path by the same law, so vehicles that
+brake at the same tick pass through pairs of positions that are compared here, and rest at such a pair. The order to
+brake may reach them at different times, which adds to the skew.
 
-A vehicle without poses or without its link leaves its path, and is not part of this certificate.
+A vehicle without poses or without its link leaves its path, which this certificate does not cover.
 """
 
 import itertools
@@ -26,15 +26,15 @@ from cfplan.planning.fleet.members import FleetMember
 from cfplan.safety.space import inside
 
 SAMPLE = 0.001  # s
-_BETWEEN = 1e-4  # m: what linear interpolation between setpoints differs from the plan, at most 5 m/s² · (10 ms)² / 8
+_BETWEEN = 1e-4  # m, error of linear interpolation between setpoints, at most 5 m/s² · (10 ms)² / 8
 
 
 @dataclass(frozen=True, slots=True)
 class Separation:
-    """The nearest that the columns of two vehicles come to each other."""
+    """The nearest approach of the columns of two vehicles."""
 
     pair: tuple[str, str]
-    distance: float  # m, at least: between samples and over the skew too
+    distance: float  # m, lower bound, including between samples and over the skew
     place: tuple[float, float]  # m, x and y, in the middle between them
     time: float  # s after the fleet's start
 
@@ -49,7 +49,7 @@ class Separation:
 
 
 def separations(members: Sequence[FleetMember], skew: float) -> tuple[Separation, ...]:
-    """Return the nearest approach of each pair, the nearest first, for clocks that differ by `skew`, s, at most."""
+    """Return the nearest approach of each pair, the nearest first, for clocks that differ by at most `skew`, s."""
     end = max(member.end for member in members)
     times = np.arange(0.0, end + SAMPLE, SAMPLE)
     columns = [member.columns(times) for member in members]

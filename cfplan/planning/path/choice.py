@@ -1,9 +1,9 @@
 """The choice of the fastest path through waypoints.
 
-A path of least snap is shaped by the times of its segments and by points between the waypoints: with times like the
-straight lengths it swings far out where these differ. Both are chosen so that the flight time is least, by descending
-along its gradient (cost.py, search.py). What is found is planned and certified beside both paths of least snap, and the
-shortest of these flights is taken.
+A path of least snap is shaped by the times of its segments and by points between the waypoints: with times in
+proportion to straight lengths it swings far out where these differ. Both are chosen for the least flight time, by
+descending along its gradient (cost.py, search.py). The result and two minimum-snap paths are planned and certified, and
+the shortest of these flights is used.
 """
 
 import math
@@ -25,16 +25,16 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 
 CHOOSING = 0.5  # of the budget of planning
-CERTIFYING = 0.2  # of the time for choosing, kept for certifying what was found
+CERTIFYING = 0.2  # of the time for choosing, kept for certifying the result
 
 
 class FastestPath(NamedTuple):
     """A chosen path through waypoints, its flight time, and that along min-snap."""
 
     path: Path
-    duration: float  # s, of the certified flight at full speed; infinite where there is none
+    duration: float  # s, of the certified flight at full speed; infinite if there is none
     min_snap: float  # s, likewise along the better path of least snap, with times like the lengths or centripetal ones
-    least_snap: Path  # that one; the one with centripetal times where neither can be flown
+    least_snap: Path  # that path; if neither can be flown, the one with centripetal times
     finished: bool  # whether the search ended before the deadline
 
     def describe(self, speed_factor: float) -> str:
@@ -47,7 +47,7 @@ class FastestPath(NamedTuple):
 def chosen_path(
     path_file: PathFile, limits: Limits, *, budget: float | None = None, models: tuple[pathlib.Path, ...] = ()
 ) -> tuple[PathFile, FastestPath | None]:
-    """Return the path file with the path that its shape asks for, and the choice, if one was made.
+    """Return the path file with the path of its shape, and the choice, if one was made.
 
     Choosing takes at most half of the budget of planning, s; None is that of the path of least snap.
 
@@ -55,7 +55,7 @@ def chosen_path(
         InfeasibleError: a gate or a corridor cannot be flown through.
     """
     if path_file.shape is not PathShape.FASTEST or not limits.space.holds(path_file.waypoints):
-        return path_file, None  # a waypoint outside the space is refused by what plans the path
+        return path_file, None  # planning refuses a waypoint outside the space
     seconds = CHOOSING * (default_budget(path_file.path) if budget is None else budget)
     fastest = fastest_path(path_file, limits, deadline=Deadline.after(seconds), models=models)
     return replace(path_file, path=fastest.path), fastest
@@ -66,8 +66,8 @@ def fastest_path(
 ) -> FastestPath:
     """Return the path through a path file's waypoints, at rest at both ends, with the shortest certified flight.
 
-    Waypoints of several laps have the same times in each lap. After the deadline the best path found by then is the
-    answer. Where none can be flown, the path that leaves the room least is; planning it says why.
+    Waypoints of several laps have the same times in each lap. After the deadline the best path found so far is
+    returned. If none can be flown, it is the path that leaves the room least; planning it reports why.
 
     Raises:
         InfeasibleError: a gate or a corridor cannot be flown through.
@@ -91,7 +91,7 @@ def fastest_path(
     durations = [certified(path) for path in (found.knots.path, *paths)]
     plain = path_file.corridor is None and not limits.space.obstacles
     plain = plain and not any(isinstance(each, Gate) for each in path_file.regions)
-    best = int(np.argmin(durations)) if plain else 0  # the first of equal ones
+    best = int(np.argmin(durations)) if plain else 0  # the first of equals
     least_snap = paths[0] if durations[1] < durations[2] else paths[1]
     return FastestPath(
         (found.knots.path, *paths)[best], durations[best], min(durations[1:]), least_snap, found.finished
@@ -99,7 +99,7 @@ def fastest_path(
 
 
 def _check_gates(path_file: PathFile, limits: Limits) -> None:
-    """Raise InfeasibleError where a gate leaves no room for the vehicle."""
+    """Raise InfeasibleError if a gate leaves no room for the vehicle."""
     margin = limits.space.margin
     for number, region in enumerate(path_file.regions, start=1):
         if isinstance(region, Gate) and min(region.width, region.height) <= 2.0 * margin:
@@ -113,9 +113,9 @@ def _check_gates(path_file: PathFile, limits: Limits) -> None:
 
 
 def _check_kept(found: ChosenKnots, path_file: PathFile) -> None:
-    """Raise InfeasibleError where a path leaves the corridor, or passes a gate backwards.
+    """Raise InfeasibleError if a path leaves the corridor, or passes a gate backwards.
 
-    Walls and obstacles are checked by what plans the path.
+    Walls and obstacles are checked in planning.
     """
     path, cut, more = found.knots.path, not found.finished, "give planning more time (--budget)"
     for number, (point, region) in enumerate(zip(found.knots.waypoint, path_file.regions, strict=True), start=1):

@@ -1,7 +1,7 @@
 """The cost by which a path is chosen: its flight time plus a penalty on leaving the room, with the gradient.
 
-The multipliers of the expert's problem say how the flight time changes with the path (expert/sensitivity.py); one
-adjoint solve carries that to segment times and points (geometry/min_snap_gradient.py).
+The multipliers of the expert's problem give the derivative of flight time by the path (expert/sensitivity.py); one
+adjoint solve propagates it to segment times and points (geometry/min_snap_gradient.py).
 """
 
 import math
@@ -27,7 +27,7 @@ from cfplan.vehicle.profile import BoundaryState
 
 NODES_PER_METRE, NODES_PER_PIECE, LEAST_NODES = 4, 4, 60  # of the expert's grid while a path is chosen
 STILL = 1e-3  # of the nominal speed, below which a path stands still
-FORWARDS = 0.2  # of the nominal speed of 1 m/s, at which gates are passed forwards at least
+FORWARDS = 0.2  # of the nominal speed of 1 m/s, least forward speed through gates
 _SAMPLES = 33  # of each piece, where a corridor is checked
 
 Timing = tuple[float, NDArray, NDArray]  # s; its derivatives, (5, 3, P), by γ to γ'''' at some places; those, (P,)
@@ -45,15 +45,15 @@ class Course:
 
 @dataclass(slots=True, eq=False)
 class PathCost:
-    """The flight time along the path of some variables, s, and what leaving the room costs; with its gradient."""
+    """Flight time along the path of some variables, s, plus a penalty on leaving the room; with its gradient."""
 
     course: Course
     limits: Limits
     room: Room
     variables: ChoiceVariables
     deadline: Deadline
-    weight: float = 0.0  # s/m³, of what leaves the room
-    reserve: float = 0.0  # m, that is kept inside
+    weight: float = 0.0  # s/m³, of the excursion from the room
+    reserve: float = 0.0  # m, distance kept inside
     nodes: int = field(init=False)  # of the grid, the same for all paths
     near: NDArray | None = field(default=None, init=False)  # coefficients of the last profile
     best: NDArray | None = field(default=None, init=False)  # x of the fastest path inside the room so far
@@ -71,7 +71,7 @@ class PathCost:
         return timed, gradient
 
     def by_length(self, x: NDArray) -> tuple[float, NDArray]:
-        """Return the same with the time that the path would take at the limit of speed: a hundredth of the work."""
+        """Return the same with the time at constant maximum speed instead: a hundredth of the work."""
         return self._cost(x, self._time_by_length)[:2]
 
     def _flight_time(self, path: Path) -> Timing | None:
@@ -101,7 +101,7 @@ class PathCost:
         failed = math.inf, np.zeros_like(x), math.inf
         try:
             path = knots.path
-        except InputError:  # times so different that they make no path
+        except InputError:  # the times differ too much to make a path
             return failed
         timed = time(path)
         if timed is None:
@@ -125,7 +125,7 @@ class PathCost:
         return cost, self.variables.gradient(x, by_times, by_points), duration
 
     def _leg(self, knots: Knots, s: NDArray) -> NDArray:
-        """Return which line between waypoints each place belongs to, (P,)."""
+        """Return the line between waypoints of each place, (P,)."""
         return np.searchsorted(knots.breaks[knots.waypoint[1:-1]], s, side="right")
 
     def _backwards(self, knots: Knots, path: Path) -> tuple[float, NDArray, NDArray]:
@@ -148,7 +148,7 @@ class PathCost:
         return max(float(beyond.max()), self.aside(x)[0])
 
     def aside(self, x: NDArray) -> tuple[float, int]:
-        """Return how far, m, it leaves the corridor, likewise, and the straight line where it does most."""
+        """Return how far, m, the path leaves the corridor, likewise, and the worst straight line."""
         if self.room.corridor is None:
             return -math.inf, 0
         knots = self.variables.knots(x)

@@ -12,9 +12,9 @@ from cfplan.deadline import Deadline
 _REMEMBERED = 12  # steps, and changes of the gradient over them
 _ARMIJO = 1e-4
 _HALVINGS = 6
-_LONGEST = 1.0  # change of a variable in a step
+_LONGEST = 1.0  # largest change of a variable in a step
 
-Cost = Callable[[NDArray], tuple[float, NDArray]]  # of x, (n,): the cost, infinite where it fails, and its gradient
+Cost = Callable[[NDArray], tuple[float, NDArray]]  # of x, (n,): the cost, infinite if it fails, and its gradient
 
 
 class Descended(NamedTuple):
@@ -50,7 +50,7 @@ def descend(cost: Cost, x: NDArray, deadline: Deadline, *, tolerance: float, ite
         else:
             if not steps:
                 break
-            steps, changes = [], []  # once more, down the gradient itself
+            steps, changes = [], []  # restart with the gradient itself
             continue
         step, change = there - x, gradient_there - gradient
         if step @ change > 1e-10 * float(np.linalg.norm(step) * np.linalg.norm(change)):

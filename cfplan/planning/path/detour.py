@@ -1,7 +1,7 @@
 """Corners of a short way around obstacles, where the straight way between two waypoints is blocked.
 
-The way is the shortest on a grid of the free space, and leaves out every corner past which the next one is in sight.
-It is where the search for a path begins, and decides on which side obstacles are passed.
+The way is the shortest on a grid of the free space, without corners that can be skipped in a straight line. The search
+for a path begins with it, which decides the side on which obstacles are passed.
 """
 
 import itertools
@@ -19,7 +19,7 @@ _SIGHT = 0.02  # m between places on a straight way, at most
 def with_corners(waypoints: NDArray, space: Space) -> tuple[NDArray, NDArray]:
     """Return waypoints, (K, 3) m, with corners on blocked ways between them, and the rows of the waypoints, (K,).
 
-    A way for which no detour is found is left as it is.
+    A way without a detour is left unchanged.
     """
     found, rows = [waypoints[0]], [0]
     for begin, end in itertools.pairwise(waypoints):
@@ -36,13 +36,13 @@ def _in_sight(begin: NDArray, end: NDArray, space: Space) -> bool:
     return bool(inside(space.farthest(np.linspace(begin, end, count))))
 
 
-@lru_cache(maxsize=2)  # the same room is asked about again and again in flight
+@lru_cache(maxsize=2)  # in flight the same room is queried repeatedly
 def _grid(space: Space) -> "_Grid":
     return _Grid(space)
 
 
 class _Grid:
-    """Places in a space, which of them are clear, and the ways between neighbours."""
+    """A grid of places in a space, which of them are clear, and the edges between neighbours."""
 
     def __init__(self, space: Space) -> None:
         from scipy.sparse import coo_array  # slow to import
@@ -57,7 +57,7 @@ class _Grid:
         number = np.arange(len(self.places)).reshape(shape)
         rows, columns = [], []
         for step in itertools.product((-1, 0, 1), repeat=3):
-            if step > (0, 0, 0):  # the other half are the same ways backwards
+            if step > (0, 0, 0):  # the other half are the same edges reversed
                 here = tuple(slice(max(-each, 0), min(n - each, n)) for each, n in zip(step, shape, strict=True))
                 there = tuple(slice(max(each, 0), min(n + each, n)) for each, n in zip(step, shape, strict=True))
                 rows.append(number[here].ravel())
@@ -69,7 +69,7 @@ class _Grid:
         self.ways = coo_array((length, (one, other)), shape=(len(self.places),) * 2).tocsr()
 
     def corners(self, begin: NDArray, end: NDArray) -> list[NDArray]:
-        """Return the corners of a short way between two places; none where there is no way."""
+        """Return the corners of a short way between two places; none if there is no way."""
         from scipy.sparse.csgraph import dijkstra
 
         first, last = self._nearest(begin), self._nearest(end)
@@ -94,7 +94,7 @@ class _Grid:
         return corners
 
     def _nearest(self, place: NDArray) -> int | None:
-        """Return the number of the nearest clear place; None where there is none."""
+        """Return the number of the nearest clear place; None if there is none."""
         if not self.clear.any():
             return None
         away = np.where(self.clear, ((self.places - place) ** 2).sum(axis=1), np.inf)

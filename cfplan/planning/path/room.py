@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cfplan.safety.space import SIDES, Box, Obstacle, Space
 
-_LINK_LOSS_CLEARANCE = 0.15  # m, added to the margin of obstacles where link loss must end clear of them
+_LINK_LOSS_CLEARANCE = 0.15  # m, added to the margin of obstacles if link loss must end clear of them
 _MOVED = 1e-6  # m, step of finite differences
 
 
@@ -23,7 +23,7 @@ class Room:
     def to_come_down(self) -> "Room":
         """Return the room for a vehicle that must come down clear of obstacles wherever it loses link.
 
-        Obstacles reach from the floor to the ceiling, except those that a waypoint is above, beneath or too near to.
+        Obstacles are extended from the floor to the ceiling, unless a waypoint is above, below or too near.
         """
         columns = []
         for each in self.space.obstacles:
@@ -71,7 +71,7 @@ class Room:
 
 
 def _column(obstacle: Obstacle, space: Space) -> Obstacle:
-    """Return an obstacle from the floor to the ceiling."""
+    """Return an obstacle extended from the floor to the ceiling."""
     floor, ceiling = space.low[2], space.high[2]
     if isinstance(obstacle, Box):
         return replace(obstacle, low=(*obstacle.low[:2], floor), high=(*obstacle.high[:2], ceiling))

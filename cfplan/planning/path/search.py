@@ -1,4 +1,4 @@
-"""The search for the fastest path through waypoints: where it starts, and how it is kept in the room."""
+"""The search for the fastest path through waypoints: its starting points, and how the path is kept in the room."""
 
 import math
 from dataclasses import replace
@@ -25,15 +25,13 @@ from cfplan.safety.limits import Limits, PlanLimits
 from cfplan.safety.limits_file import load_limits
 from cfplan.safety.space import Space, inside
 
-TOLERANCE, ITERATIONS = 2e-4, 80  # share of the flight time by which steps improve it at last; steps at most
-LOOSE_TOLERANCE = 0.01  # the same of a first descent, by the length of the path
-# Weights of what leaves the room, s/m³: each descent that ends outside is followed by one with the next weight, which
-# keeps further inside by what was missed.
+TOLERANCE, ITERATIONS = 2e-4, 80  # relative improvement of the flight time at which it stops; most steps
+LOOSE_TOLERANCE = 0.01  # the same for the first descent, by the length of the path
+# Weights of the excursion from the room, s/m³: a descent that ends outside is repeated with the next weight, and keeps
+# further inside by as much.
 WEIGHTS = (100.0, 1e3, 1e4, 1e5, 1e5, 1e5)
-_ASSUMED_ACCELERATION = (
-    0.5  # of the limit on acceleration, with which speeds change in the times that a search begins with
-)
-RESERVE = 0.002  # m, kept inside beyond what was missed
+_ASSUMED_ACCELERATION = 0.5  # of the limit on acceleration, assumed in initial times
+RESERVE = 0.002  # m, kept inside in addition
 
 
 class ChosenKnots(NamedTuple):
@@ -42,7 +40,7 @@ class ChosenKnots(NamedTuple):
     knots: Knots
     missed: float  # m, how far the path leaves the room; negative inside
     aside: float  # m, how far it leaves the corridor; likewise
-    aside_leg: int  # the straight line between waypoints where it does so most, counted from 0
+    aside_leg: int  # the worst straight line between waypoints, from 0
     finished: bool  # before the deadline
 
 
@@ -56,8 +54,8 @@ def timed(points: NDArray, waypoint: NDArray) -> tuple[Knots, Knots]:
 def times_as_flown(points: NDArray, limits: PlanLimits) -> NDArray:
     """Return about how long the straight lines between points, (K, 3) m, would take, (K-1,) s, from rest to rest.
 
-    Speed falls to the cosine of half the angle by which the lines turn. So points close together on a line, between
-    which the vehicle neither turns nor slows down, do not slow it down in the path's times either.
+    At a corner the speed falls to the cosine of half its angle, so close points on a straight line do not slow the
+    vehicle down in these times.
     """
     steps = np.diff(points, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
@@ -76,9 +74,9 @@ def times_as_flown(points: NDArray, limits: PlanLimits) -> NDArray:
 
 
 def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
-    """Return the best that descent finds of segment times, of waypoints within their regions, and of points between.
+    """Return the best result of descents over segment times, waypoints within their regions, and points between.
 
-    Where link loss must end clear of obstacles, it is sought where that is likely; and elsewhere if there is none.
+    If link loss must end clear of obstacles, paths for which that is likely are searched first.
     """
     room = Room(limits.space, path_file.waypoints, path_file.corridor)
     rooms = [room]
@@ -92,9 +90,9 @@ def search(path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKno
 
 
 def fastest_by_search(points: NDArray, space: Space, chosen: LimitSet, yaw: YawMode, yaw_angle: float) -> Path:
-    """Return the path that a search without a deadline finds through waypoints, (K, 3) m, as datasets have them.
+    """Return the path found through waypoints, (K, 3) m, by a search without a deadline, for datasets.
 
-    The same on every machine that computes alike, as no clock and no network decides it.
+    It is reproducible, as it depends neither on a clock nor on a network.
     """
     path_file = replace(path_through(points), yaw=yaw, yaw_angle=yaw_angle)
     limits = replace(_example_limits(), airframe=chosen.airframe, plan=chosen.limits, space=space)
@@ -107,7 +105,7 @@ def _example_limits() -> Limits:
 
 
 def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadline) -> ChosenKnots:
-    """Return the best that descent finds from the best of three timings."""
+    """Return the result of a descent from the best of three timings."""
     points, waypoint = with_corners(path_file.waypoints, room.space)
     flown = times_as_flown(points, limits.plan)
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
@@ -130,7 +128,7 @@ def _search_in(room: Room, path_file: PathFile, limits: Limits, deadline: Deadli
 def _descend_inside(
     kept: PathCost, cost: Cost, x: NDArray, tolerance: float, deadline: Deadline
 ) -> tuple[NDArray, bool]:
-    """Descend from x until the path stays inside the room, and return where that ended, and whether in time."""
+    """Descend from x until the path stays inside the room, and return its end, and whether it finished in time."""
     kept.reserve = 0.0
     for weight in WEIGHTS:
         kept.weight = weight
@@ -144,7 +142,7 @@ def _descend_inside(
 
 
 def _started(path_file: PathFile, knots: Knots) -> Knots:
-    """Return the knots at which a search starts: with a point between each two, which leads into gates forwards."""
+    """Return initial knots, with a point between each two waypoints that leads forwards into gates."""
     knots = with_points_between(knots)
     for point, region in zip(knots.waypoint, path_file.regions, strict=True):
         if isinstance(region, Gate):

@@ -20,16 +20,16 @@ POINT_UNIT, LARGEST_POINT_UNIT = 0.15, 0.2  # of the distance to the nearer neig
 
 
 class Knots(NamedTuple):
-    """The times and points that a path of least snap is laid through."""
+    """Times and points of a minimum-snap path."""
 
     times: NDArray  # (M,) s
     points: NDArray  # (M+1, 3) m
     waypoint: NDArray  # (K,) the numbers of the waypoints among the points
-    start: NDArray | None = None  # (5, 3) γ to γ'''' where the path begins in motion; None: at rest
+    start: NDArray | None = None  # (5, 3) γ to γ'''' if the path begins in motion; None: at rest
 
     @property
     def path(self) -> Path:
-        """Return the path of least snap through the points. Raises InputError where there is none."""
+        """Return the path of least snap through the points. Raises InputError if there is none."""
         if self.start is None:
             return least_snap(self.points, self.times)
         return continued_through(self.start, self.points, self.times)
@@ -47,11 +47,11 @@ class Knots(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChoiceVariables:
-    """The variables of a choice, x, (n,), the map from them to times and points, and the way back for gradients."""
+    """The variables of a choice, x, (n,), with the map to times and points, and its transpose for gradients."""
 
-    start: Knots  # where all variables but those of times are 0
-    axes: NDArray  # (P, 3, 3) m, rows: along which each point of a lap may move
-    bounded: NDArray  # (P,) 0 where it moves without bounds, 1 within a ball, 2 within a box
+    start: Knots  # with all variables 0 except those of times
+    axes: NDArray  # (P, 3, 3) m, rows: axes of motion of each point of a lap
+    bounded: NDArray  # (P,) 0: unbounded, 1: within a ball, 2: within a box
     time_of: NDArray  # (M,) the number of each segment's variable
     point_of: NDArray  # (M+1,) the number of each point within its lap
     moving: NDArray  # (Q,) the points of a lap that may move
@@ -64,7 +64,7 @@ class ChoiceVariables:
         return np.concatenate([(logs - logs.mean()) / TIME_UNIT, np.zeros(3 * len(self.moving))])
 
     def knots(self, x: NDArray) -> Knots:
-        """Return the times, which last as long as the start's together, and points of variables."""
+        """Return the times, scaled to the start's total, and the points of variables."""
         offsets, _ = self._offsets(x)
         points = self.start.points + offsets[self.point_of]
         return self.start._replace(times=self._times(x), points=points)
@@ -117,7 +117,7 @@ def variables_of(knots: Knots, regions: tuple[Region, ...], laps: int, margin: f
     moves = np.ones(len(points), dtype=bool)
     for point, region in zip(knots.waypoint, regions, strict=True):
         if point >= len(points):
-            continue  # of a later lap
+            continue  # a later lap
         match region:
             case Within(radius):
                 axes[point], bounded[point] = radius * np.eye(3), 1

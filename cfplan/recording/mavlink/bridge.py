@@ -1,8 +1,8 @@
-"""The MAVLink bridge: to and from ground stations during a flight, without ever holding the flight up.
+"""The MAVLink bridge: to and from ground stations during a flight, without ever delaying the flight.
 
 A thread of the main process, never of the pilot's, sends the pilot's telemetry and listens for
-commands to stop. Those come out of `orders`, on the same way into the pilot as the keys. All packets of both
-directions are kept in a .tlog: each behind its time, µs since 1970, 8 bytes big endian.
+commands to stop. These are returned by `orders`, and reach the pilot like keys. All packets of both directions
+are kept in a .tlog, each after its time, µs since 1970, 8 bytes big endian.
 """
 
 import contextlib
@@ -28,9 +28,9 @@ BROADCAST = 0
 _V1, _V2, _SIGNED = 0xFE, 0xFD, 0x01
 _LARGEST_DATAGRAM = 2048  # bytes; MAVLink's are never longer
 _DATAGRAMS_AT_ONCE = 50  # before it is time to send again
-_SHORTEST_WAIT, _LONGEST_WAIT = 0.001, 0.1  # s between two looks at what is due
+_SHORTEST_WAIT, _LONGEST_WAIT = 0.001, 0.1  # s between checks of what is due
 _FLUSH_PERIOD = 1.0  # s, of the .tlog
-_CLOSE_TIMEOUT = 2.0  # s that the end of a flight waits for the last packets
+_CLOSE_TIMEOUT = 2.0  # s to wait for the last packets at the end of a flight
 _SEVERITY = {Level.INFO: 6, Level.WARNING: 4, Level.ERROR: 3}  # MAV_SEVERITY
 _WARNING = 4
 _FORM = "as in udp:127.0.0.1:14550, where the ground station listens"
@@ -76,7 +76,7 @@ class GroundStation:
     """
 
     def __init__(self, place: Place, log: Path | None = None, *, boot: float | None = None, clock: Clock = REAL_CLOCK):
-        """Raises InputError where the extra is missing, the place cannot be reached or the log cannot be written."""
+        """Raises InputError if the extra is missing, the address cannot be reached or the log cannot be written."""
         self._mav = _dialect().MAVLink(self, srcSystem=SYSTEM, srcComponent=COMPONENT)
         self._clock = clock
         self._wall_zero = time.time() - clock.now()  # s since 1970 at which the clock was zero
@@ -96,7 +96,7 @@ class GroundStation:
                     f"cannot be written ({error.strerror or error})", where=str(log), hint="choose another folder"
                 ) from error
         self._flushed = 0.0
-        self.failure = ""  # why the log is not whole, one line; empty where it is
+        self.failure = ""  # why the log is incomplete, one line; empty if it is not
         self.heard = 0  # packets from ground stations
         self._serving: Repeated | None = None
 
@@ -139,7 +139,7 @@ class GroundStation:
     def write(self, packet: bytes) -> None:
         """Send a packet; the dialect's encoder calls this."""
         self._keep(packet)
-        with contextlib.suppress(OSError):  # no one listens there now
+        with contextlib.suppress(OSError):  # nobody is listening
             self._socket.sendto(packet, self._target)
 
     def _serve(self) -> float:
@@ -147,7 +147,7 @@ class GroundStation:
         for act in (self._listen, self._send_due):
             try:
                 act()
-            except Exception as error:  # a fault here must not silence a stop that comes later
+            except Exception as error:  # a fault here must not block a later stop
                 self._fail(f"fault in MAVLink: {error!r}")
         return min(_LONGEST_WAIT, max(_SHORTEST_WAIT, min(self._due) - self._clock.now()))
 
@@ -185,7 +185,7 @@ class GroundStation:
                 return
             try:
                 data, sender = self._socket.recvfrom(_LARGEST_DATAGRAM)
-            except OSError:  # what was sent before came back as not deliverable
+            except OSError:  # an earlier packet was not deliverable
                 continue
             if sender[:2] != self._target[:2]:  # no other program may stop the flight
                 continue
@@ -233,7 +233,7 @@ class GroundStation:
 
 
 def messages_in(data: bytes) -> Iterator[tuple[bytes, Any]]:
-    """Yield the packets of a datagram that are whole and known, in order, each with its message.
+    """Yield the complete and known packets of a datagram, in order, each with its message.
 
     Each datagram is decoded alone, so that garbage in one can never swallow a command in the next.
     """

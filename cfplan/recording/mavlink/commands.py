@@ -1,6 +1,6 @@
 """Answer a ground station's commands: it may stop a flight; everything else is refused.
 
-MAVLink is not authenticated, so nothing is obeyed that arms or moves the vehicle; a stop only makes things safer.
+MAVLink is not authenticated, so commands that arm or move the vehicle are refused; a stop only makes things safer.
 """
 
 from dataclasses import dataclass
@@ -15,8 +15,8 @@ _SET_MODE, _REPOSITION, _TERMINATE = 176, 192, 185
 _MOTOR_TEST, _REBOOT, _MISSION, _ARM = 209, 246, 300, 400
 _REQUEST_MESSAGE, _REQUEST_VERSION = 512, 520
 _REFUSED = (_RETURN, _TAKE_OFF, _GUIDED, _SET_MODE, _REPOSITION, _MOTOR_TEST, _REBOOT, _MISSION)
-FORCE = 21196  # by which a disarming is meant in the air too
-AUTOPILOT_VERSION = 148  # the one message that can be asked for
+FORCE = 21196  # parameter that extends disarming to the air
+AUTOPILOT_VERSION = 148  # the only message that can be requested
 
 
 class Result(IntEnum):
@@ -34,7 +34,7 @@ class Answer:
     result: Result
     order: Order | None = None  # for the pilot
     text: str = ""  # sent to all ground stations as a status text
-    message: int | None = None  # that was asked for
+    message: int | None = None  # requested message
 
 
 def answer(command: int, parameters: tuple[float, ...]) -> Answer:

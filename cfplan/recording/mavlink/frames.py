@@ -1,7 +1,7 @@
-"""Convert from our axes (world z up, body forward, left, up) to MAVLink's (north, east, down; forward, right, down).
+"""Convert axes: cfplan (world z up, body forward, left, up) to MAVLink (north, east, down; forward, right, down).
 
-A laboratory has no north: its y axis is sent as north and its x axis as east, so that yaw turns the right way and a
-log that is read back lies as the flight did. Quaternions are x y z w here and w x y z there.
+A laboratory has no north: its y axis is sent as north and its x axis as east, so that yaw has the right sense and a log
+reads back in its original orientation. Quaternions are x y z w here and w x y z there.
 """
 
 import math

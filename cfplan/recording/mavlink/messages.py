@@ -1,4 +1,4 @@
-"""Make the messages for ground stations of the pilot's newest telemetry, each at its own rate."""
+"""Messages for ground stations from the pilot's newest telemetry, each at its own rate."""
 
 import math
 from collections.abc import Callable

@@ -5,7 +5,7 @@ tilts the body against its motion (v_y about x, -v_x about y: blade flapping, dr
 proportion to |v|² in the rotor plane: more thrust at the same rotor speed. Real flights show all three. Motors give the
 commanded thrust times the airframe's thrust scale; a curved thrust is a parabola through zero thrust and hover.
 
-Semi-implicit Euler, each line using what the lines above it made: motors, body rate, velocity, position, attitude.
+Semi-implicit Euler, in order: motors, body rate, velocity, position, attitude; each step uses the results before it.
 
 The floor is inelastic and holds: a body on it that the rotors do not lift stays where it is and tips over, back onto
 its feet or, if it came down steeper than `TIPPING_ANGLE`, onto its back, where it stays. It turns at a finite rate, so
@@ -65,7 +65,7 @@ def step_body(vehicle: NDArray, step: float) -> None:
 
 @njit(allocates=False, error_model="numpy")
 def step_and_feel(vehicle: NDArray, step: float, felt: NDArray) -> None:
-    """Advance one vehicle; write the specific force, (3,) m/s² in body axes, that its accelerometer measures then."""
+    """Advance one vehicle; write the specific force, (3,) m/s² in body axes, measured by its accelerometer."""
     vx, vy, vz = vehicle[3], vehicle[4], vehicle[5]
     step_body(vehicle, step)
     axes = axes_of(vehicle[6], vehicle[7], vehicle[8], vehicle[9])

@@ -46,15 +46,15 @@ _POSE_PERIOD = 10  # ms, while it settles
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EstimatorInput:
-    """The poses that a vehicle was sent, and the parameters of its filter."""
+    """The poses sent to a vehicle, and the parameters of its filter."""
 
     time: NDArray  # (M,) s, when each arrived
     latency: float = POSE_LATENCY  # s
-    attitude_latency: float | None = None  # s of its attitude, where that is another
-    with_attitude: bool = True  # a single marker gives none
+    attitude_latency: float | None = None  # s of its attitude, if different
+    with_attitude: bool = True  # False for a single marker
     position_deviation: float = 0.001  # m, as set in the firmware (locSrv.extPosStdDev)
     attitude_deviation: float = 0.05  # rad (locSrv.extQuatStdDev)
-    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s that the filter knows (kalman.dragB)
+    drag: tuple[float, float, float] = (0.0, 0.0, 0.0)  # 1/s, in the filter's model (kalman.dragB)
     noise: NDArray = field(default_factory=lambda: np.zeros((0, 6)))  # (M or 0, 6) m, and rad about the body's axes
 
 
@@ -64,8 +64,8 @@ class EstimatedFlight:
 
     states: NDArray  # (N, 17) as in `layout`
     beliefs: NDArray  # (N, 13) estimated position, velocity, quaternion; body rate as measured
-    control: NDArray  # (N, 4) thrust N and torques N m that the controller asked for
-    asked: NDArray  # (N, 4) N, thrust that it asked of each motor
+    control: NDArray  # (N, 4) thrust N and torques N m commanded by the controller
+    asked: NDArray  # (N, 4) N, commanded thrust of each motor
 
 
 class _Loop(NamedTuple):
@@ -80,7 +80,7 @@ class _Loop(NamedTuple):
     mode: mellinger.Modes  # (7,) of Mellinger's
     gains: NDArray
     vehicle: NDArray  # (77,) as in `layout`: body, memory of the controller, setpoint, airframe
-    levers: NDArray  # (5,) arm m, yaw torque per thrust m, most thrust of a motor N, N per 16-bit unit, by Mellinger
+    levers: NDArray  # (5,) arm m, yaw torque per thrust m, largest motor thrust N, N per 16-bit unit, Mellinger or not
     scale: NDArray  # (N,) the body's thrust scale, which falls with the battery
     arrivals: NDArray  # (M,) ms of each pose
     noise: NDArray  # (M or 0, 6) m and rad, of each pose
@@ -160,7 +160,7 @@ def _lowpass(cutoff: float) -> NDArray:
 
 
 def _settled(start: NDArray, pose: NDArray, prior: NDArray) -> Filter:
-    """Return a filter whose covariance has settled in hover, and which believes `start`."""
+    """Return a filter whose covariance has settled in hover, with `start` as its estimate."""
     kalman = Filter(*(part.copy() for part in _hovered(yaw_of(start[6:10]), tuple(pose[2:]), tuple(prior))))
     kalman.state[:3], kalman.state[3:6] = start[:3], matrix_of(start[6:10]).T @ start[3:6]
     kalman.quaternion[:] = start[6:10]
@@ -191,7 +191,7 @@ def _run(loop: _Loop, estimator: bool) -> None:
     vehicle, belief, control = loop.vehicle, loop.beliefs[0].copy(), np.zeros(4)
     state = vehicle[:STATE_SIZE]
     vehicle[ASKED : ASKED + 4] = state[13:17] / loop.scale[0]
-    rates, forces = np.zeros(3), np.array([0.0, 0.0, GRAVITY])  # as they are, and as they pass the low-passes
+    rates, forces = np.zeros(3), np.array([0.0, 0.0, GRAVITY])  # true, and low-pass filtered
     gyro, acceleration, past = state[10:13].copy(), forces.copy(), np.zeros((2, 3, 2))
     for _ in range(200):
         _filter(loop.lowpass[0], past[0], state[10:13], gyro)

@@ -2,7 +2,7 @@
 
 Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (2010), with attitude by the Hopf
 fibration (Watterson and Kumar, 2019) and the gains of TOPPQuad's Table III. Body rate and angular acceleration of the
-reference are fed forward. It knows the true state, and the motors' range binds only what they give, not what it asks.
+reference are fed forward. It knows the true state, and the motors' range limits only their thrust, not its commands.
 """
 
 from collections.abc import Callable
@@ -103,9 +103,9 @@ def _control(command: NDArray, wanted: NDArray, state: NDArray, believed: _Belie
     size = np.sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
     half = 0.5 * wanted[YAW]
     aim = hopf_quaternion((force[0] / size, force[1] / size, force[2] / size), np.cos(half), np.sin(half))
-    axes: NDArray = np.array(axes_of(state[6], state[7], state[8], state[9]))  # a row each
+    axes: NDArray = np.array(axes_of(state[6], state[7], state[8], state[9]))  # one per row
     aimed: NDArray = np.array(axes_of(aim[0], aim[1], aim[2], aim[3]))
-    relative = aimed @ axes.T  # what the body's axes are in the axes that it aims at, a column each
+    relative = aimed @ axes.T  # the body's axes in the desired axes, one per column
     error[0] = 0.5 * (relative[2, 1] - relative[1, 2])
     error[1] = 0.5 * (relative[0, 2] - relative[2, 0])
     error[2] = 0.5 * (relative[1, 0] - relative[0, 1])

@@ -2,8 +2,8 @@
 
 Mueller, Hamer and D'Andrea, "Fusing ultra-wideband range measurements with accelerometers and rate gyroscopes for
 quadrocopter state estimation" (2015); Mueller, Hehn and D'Andrea, "Covariance correction step for Kalman filtering
-with an attitude" (2017); parameters of crazyflie-firmware 2026.08. In flight only the accelerometer's z counts, so
-drag is unknown to it and sideways motion hangs on attitude and poses; without poses it coasts.
+with an attitude" (2017); parameters of crazyflie-firmware 2026.08. In flight only the accelerometer's z is
+used, so drag is not modelled, and sideways motion depends on attitude and poses; without poses it coasts.
 
 Everything runs inside numba, in plain loops, which compile several times faster than array expressions; the filter
 is a tuple of arrays that are changed in place:
@@ -29,7 +29,7 @@ _TICK = 0.001  # s
 _SIZE = 9
 _SMALLEST_COVARIANCE, _LARGEST_COVARIANCE = 1e-6, 100.0
 _INITIAL_DEVIATIONS = (100.0, 100.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01)
-_ATTITUDE_REVERSION = 0.001  # share per prediction by which a vehicle that does not fly reverts to level
+_ATTITUDE_REVERSION = 0.001  # fraction per prediction by which a vehicle on the ground reverts to level
 _SMALLEST_CORRECTION = 1e-4  # rad
 
 
@@ -71,7 +71,7 @@ class Filter(NamedTuple):
     state: NDArray  # (9,)
     quaternion: NDArray  # (4,) body→world x y z w
     covariance: NDArray  # (9, 9)
-    sums: NDArray  # (7,) gyroscope 0:3 and accelerometer 3:6 since the last prediction, and how many
+    sums: NDArray  # (7,) sums of gyroscope 0:3 and accelerometer 3:6 since the last prediction, and their number
     initial: NDArray  # (4,) quaternion to which a standing vehicle reverts
 
 

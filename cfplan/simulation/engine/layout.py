@@ -1,11 +1,11 @@
-"""A simulated vehicle as numbers: the rows of a batch, and which row holds what.
+"""Memory layout of simulated vehicles: the rows of a batch, and their meaning.
 
-A batch holds one row of numbers per quantity, `width` long, one behind the other in one flat array: quantity q of lane
+A batch holds one row of numbers per quantity, `width` long, one after the other in one flat array: quantity q of lane
 n is at [q * width + n]. All steps of the simulation take (batch, width, n). A vehicle on its own is a batch of width 1,
-so its array is simply its quantities in order. With a width that the compiler knows, WIDTH, it sees that rows do not
-overlap, and works on several lanes with one instruction.
+so its array is simply its quantities in order. With the constant width WIDTH the compiler sees that rows do not
+overlap, and vectorises over lanes.
 
-A snapshot, (31,), is the first rows: the part of the state that a simulation needs to branch off another.
+A snapshot, (31,), holds the first rows: the state from which another simulation can branch off.
 """
 
 from typing import Any
@@ -19,7 +19,7 @@ from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.rotations import Vector, about_z, yaw_of
 
 WIDTH = 32  # lanes of a batch
-_VECTOR = 8  # lanes that a processor may work on at once
+_VECTOR = 8  # lanes per vector instruction
 
 POSITION = slice(0, 3)  # m
 VELOCITY = slice(3, 6)  # m/s
@@ -29,9 +29,9 @@ MOTORS = slice(13, 17)  # N, thrust of each motor
 STATE_SIZE = 17
 MEMORY = STATE_SIZE  # of the controller, see `mellinger`
 MEMORY_SIZE = 10
-ASKED = MEMORY + MEMORY_SIZE  # N, thrust asked of each motor
+ASKED = MEMORY + MEMORY_SIZE  # N, commanded thrust of each motor
 SNAPSHOT_SIZE = ASKED + 4
-SETPOINT = SNAPSHOT_SIZE  # as the controller takes it, see `mellinger`
+SETPOINT = SNAPSHOT_SIZE  # setpoint of the controller, see `mellinger`
 SETPOINT_SIZE = 20
 MISSED = SETPOINT + SETPOINT_SIZE  # m and m/s: true less estimated position and velocity
 AIRFRAME = MISSED + 6

@@ -53,8 +53,8 @@ from cfplan.simulation.engine.mellinger import (
 NEVER = 2**40  # ms
 PART = 150  # ms of motion per box, unless a schedule says otherwise
 _WORTH_THREADS = 2_000_000  # lanes times ms, above which a second thread saves time
-# Rows behind those of the vehicle: box swept, setpoint that is due, squared deviation, cosine of tilt, and the
-# acceleration by which the estimate is wrong without poses, m/s².
+# Rows after those of the vehicle: swept box, setpoint that is due, squared deviation, cosine of tilt, and the
+# acceleration error of the estimate without poses, m/s².
 _LOW, _HIGH, _DUE, _FARTHEST, _LEAST_LIFT, _BLIND = (VEHICLE_SIZE + k for k in (0, 3, 6, 9, 10, 11))
 _ROWS = VEHICLE_SIZE + 14
 
@@ -67,7 +67,7 @@ class Vehicles(NamedTuple):
     first: NDArray  # (L,) int, row of the setpoint that arrives at the beginning
     last: NDArray  # (L,) int, row of the last one, which then stays due
     deaf_until: NDArray  # (L,) int, ms until which no other setpoint arrives
-    blind: NDArray  # (L, 3) m/s² by which the estimate is wrong without poses: it misses ½ a t² of the motion
+    blind: NDArray  # (L, 3) m/s², acceleration error of the estimate without poses: it misses ½ a t² of the motion
 
 
 class Schedule(NamedTuple):
@@ -84,7 +84,7 @@ class Schedule(NamedTuple):
     level_after: int = NEVER  # ms after which the vehicle levels out
     off_after: int = NEVER  # ms after which motors stop, for good; the simulation ends on the floor then
     spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
-    latency: int = 0  # ms by which the estimate is late; used with traces
+    latency: int = 0  # ms, delay of the estimate; used with traces
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
     part: int = PART  # ms of motion per box, if there are several
 
@@ -257,7 +257,7 @@ def _reduce(lanes: _Lanes, used: int, schedule: Schedule, found: Outcome, k: int
 
 @register_jitable
 def _end(lanes: _Lanes, found: Outcome, part: int) -> None:
-    """Write the results; for the remaining time the boxes enclose the vehicle where it lies."""
+    """Write the results; for the remaining time the boxes enclose the landed vehicle."""
     for n in range(lanes.size):
         number = lanes.first + n
         for each in range(part, found.boxes.shape[1]):
@@ -344,7 +344,7 @@ def _count_down(lanes: NDArray, count: int) -> int:
 
 @njit(allocates=False, error_model="numpy")
 def _widen(lanes: NDArray, count: int, aside: float) -> None:
-    """Note what each vehicle has come to: `aside`, m, widens its box, unless it stands on the floor."""
+    """Update each vehicle's results: `aside`, m, widens its box, unless it stands on the floor."""
     count = min(count, WIDTH)
     for n in range(count):
         low, high = vector(lanes, WIDTH, n, _LOW), vector(lanes, WIDTH, n, _HIGH)
@@ -364,7 +364,7 @@ def _widen(lanes: NDArray, count: int, aside: float) -> None:
 
 @register_jitable(forceinline=True)
 def _lower(value: float, other: float) -> float:
-    """Return the smaller; written so that what is no number is taken over."""
+    """Return the smaller; written so that NaN propagates."""
     return value if value <= other else other
 
 

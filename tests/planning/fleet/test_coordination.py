@@ -8,25 +8,11 @@ import pytest
 
 from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.stops import stop_motion
-from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.fleet.coordination import Blocked, coordinate
-from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import separations
-from cfplan.planning.plan import plan
 
 APART, SKEW = 0.30, 0.03
 WALLS = (-1.5, 1.5)
-
-
-@pytest.fixture(scope="module")
-def member(limits):
-    """Make a vehicle that flies through points, without looking at link loss."""
-
-    def make(name, *points):
-        planned = plan(min_snap(np.array(points, dtype=float)), limits.airframe, limits, planner="expert")
-        return FleetMember(name, planned)
-
-    return make
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,10 @@
 """Fleet files: what they say, and what is refused before anything is planned."""
 
+import json
+
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from cfplan.errors import InputError
 from cfplan.geometry.path_file import load_path_file
@@ -64,3 +68,30 @@ def test_a_fleet_file_is_told_from_a_path_file(fleet_file, tmp_path):
     assert not is_fleet_file(tmp_path / "line.yaml")
     with pytest.raises(InputError, match="a fleet file"):
         load_path_file(file)
+
+
+@pytest.mark.parametrize(("line", "only_warns"), [("", False), ("lost: refuse\n", False), ("lost: warn\n", True)])
+def test_a_lost_vehicle_is_a_reason_to_refuse_unless_the_file_says_to_warn(fleet_file, line, only_warns):
+    assert load_fleet_file(fleet_file(line + TWO)).lost_only_warns is only_warns
+
+
+@given(st.one_of(st.text(max_size=12), st.booleans(), st.none(), st.floats(), st.lists(st.integers(), max_size=2)))
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_other_word_says_what_to_do_about_lost_vehicles(fleet_file, word):
+    if word in ("refuse", "warn"):
+        return
+    file = fleet_file(f"lost: {json.dumps(word)}\n{TWO}")
+    with pytest.raises(InputError) as refused:
+        load_fleet_file(file)
+    assert refused.value.where.startswith(f"{file}:1:") or "lost" not in refused.value.what
+
+
+def test_vehicles_of_one_dongle_are_known_by_their_addresses(fleet_file):
+    three = (
+        TWO.replace("uri: 'sim://0'", "uri: 'radio://0/80/2M/E7E7E7E701'").replace(
+            "place", "uri: 'radio://0/80/2M/E7E7E7E702', place"
+        )
+        + "  c: {path: line.yaml, place: {y: 3}, uri: 'radio://1/80/2M/E7E7E7E703'}\n"
+    )
+    assert load_fleet_file(fleet_file(three)).dongles == {"0": (0, 1)}
+    assert load_fleet_file(fleet_file(TWO)).dongles == {}

@@ -1,0 +1,266 @@
+"""The certificate of lost vehicles: where a vehicle may be after its link is lost, and how near the others come.
+
+A lost vehicle no longer follows its path. Its tube encloses it at each time until it lies on the floor; there is one
+tube for each setpoint after which the link may be lost. The others either all brake once the loss is noticed, or all
+fly on: both keep them apart from each other, by the certificate of separation. If both are possible, the one that keeps
+farther away counts at each moment. Vehicles of one dongle are lost together, and their tubes are compared with each
+other too.
+
+While a lost vehicle is in the air, the others keep away from its tube at all heights. Once it lies, they may pass over
+it, but none may stop or end above it.
+
+A vehicle that is lost while it brakes for another reason is not part of this certificate.
+"""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.machine_code import njit
+from cfplan.planning.fleet.members import FleetMember, places
+from cfplan.planning.plan_result import Plan
+from cfplan.safety.space import inside
+
+NOTICED = (0.0, 0.6)  # s, soonest and latest, from the last setpoint until the others begin to brake
+"""The conductor hears at once of a pilot that ends its flight or dies. A lost link is known to the pilot 0.4 to 0.5 s
+after the last setpoint: answers to pings, ten a second, must be missing for 0.5 s (flight/pilot/health.py). A hanging
+pilot is noticed after 0.5 s. The conductor's tick and its orders take 0.1 s at most."""
+_SAMPLE = 0.005  # s of a plan, from one compared place to the next
+_BETWEEN = 1e-4  # m, as in separation.py
+REACTIONS = ("the others brake", "the others fly on")
+_RESTS = 1e3  # s before its start, of a vehicle that waits for long
+
+
+class Tube(NamedTuple):
+    """The space that a vehicle may be in after its link is lost, for each setpoint of its plan."""
+
+    boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways to be lost
+    rate: float  # Hz, of the R setpoints
+    part: float  # s of each part; the last one, in which it lies, lasts
+
+    def rows(self, own: NDArray) -> NDArray:
+        """Return the setpoint in force at own times of the plan, (N,) s: before its start the first one."""
+        return np.clip(np.round(own * self.rate), 0, self.boxes.shape[1] - 1).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """The worst moment to lose a vehicle, or all vehicles of a dongle."""
+
+    vehicles: tuple[str, ...]  # that are lost together
+    pair: tuple[str, str]  # the lost one, and the one that it comes nearest to
+    reaction: str  # of the others
+    distance: float  # m, at least, from the tube to the other's column
+    place: tuple[float, float]  # m, x and y, where the first of the pair loses its link
+    time: float  # s after the fleet's start
+    exposed: float  # fraction of the fleet's time at which the distance is less than allowed
+
+    def __str__(self) -> str:
+        a, b = self.pair
+        x, y = self.place
+        lost_too = [each for each in self.vehicles if each != a]
+        together = f", with {', '.join(lost_too)}" if lost_too else ""
+        return (
+            f"{a} lost at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s{together}, comes within {self.distance:.3f} m of "
+            f"{b}; {self.reaction}"
+        )
+
+    def keeps(self, apart: float) -> bool:
+        """Return whether that distance, m, is kept."""
+        return bool(inside(apart - self.distance))
+
+
+class _Ways(NamedTuple):
+    """How far along its plan another vehicle is after a loss, for each reaction and part of the time."""
+
+    first: NDArray  # (2, S) int, samples from the place at the loss
+    last: NDArray  # (2, S) int
+    rest: NDArray  # (2, 2) int, first and last where it rests
+    far: float  # m, the largest distance that matters
+
+
+@dataclass(frozen=True, slots=True)
+class LossModel:
+    """What vehicles do when one is lost, and how far they keep away."""
+
+    tube: Callable[[Plan], Tube]
+    stop: NDArray  # (M,) s, how far a stop goes on along a plan, at the rate of setpoints
+    together: tuple[tuple[int, ...], ...]  # numbers of the vehicles that share a dongle, of two or more
+    clearance: float  # m, from a tube to the other columns
+    fly_on: bool = True  # whether the others may fly on, where that keeps farther away
+
+    @property
+    def reactions(self) -> int:
+        """Return how many of the REACTIONS count."""
+        return 2 if self.fly_on else 1
+
+    def losses(self, members: Sequence[FleetMember], numbers: Sequence[int], skew: float) -> tuple[Loss, ...]:
+        """Return the worst moment to lose each of some vehicles of a fleet, and each dongle, the nearest first.
+
+        `numbers` are those of the members in the fleet. Clocks and orders differ by `skew`, s, at most.
+        """
+        tubes, count = [self.tube(member.plan) for member in members], len(members)
+        times = np.arange(0, int(np.ceil(max(member.end for member in members) * tubes[0].rate)) + 1) / tubes[0].rate
+        own = [times - member.delay for member in members]
+        away = np.full((count, count, self.reactions, len(times)), np.inf)  # lost, other, reaction, time
+        for i, j in itertools.permutations(range(count), 2):
+            found = distances(tubes[i], own[i], (members[j].plan, own[j]), self.stop, skew)
+            away[i, j] = found[: self.reactions]
+        worst = []
+        for group in (*((n,) for n in range(count)), *groups_among(self.together, numbers)):
+            table = np.full_like(away, np.inf)
+            for i in group:
+                others = [j for j in range(count) if j not in group]
+                table[i, others] = away[i, others]
+            for i, j in itertools.combinations(group, 2):
+                table[i, j] = tubes_apart(tubes[i], own[i], tubes[j], own[j], skew)
+            worst.append(self._worst(group, table, times, members))
+        return tuple(sorted(worst, key=lambda each: each.distance))
+
+    def _worst(self, group: tuple[int, ...], away: NDArray, times: NDArray, members: Sequence[FleetMember]) -> Loss:
+        """Return the moment at which the better reaction keeps least away; `away` has lost, other, reaction, time."""
+        kept = away.min(axis=(0, 1))
+        best = kept.max(axis=0)
+        at = int(best.argmin())
+        reaction = int(kept[:, at].argmax())
+        i, j = divmod(int(away[:, :, reaction, at].argmin()), len(members))
+        x, y = members[i].columns(times[at : at + 1])[0].tolist()
+        return Loss(
+            tuple(members[number].name for number in group),
+            (members[i].name, members[j].name),
+            REACTIONS[reaction] if len(group) < len(members) else "all are lost",
+            max(float(kept[reaction, at]), 0.0),
+            (x, y),
+            float(times[at]),
+            float(np.mean(~inside(self.clearance - best))),
+        )
+
+
+def groups_among(together: Sequence[tuple[int, ...]], numbers: Sequence[int]) -> Iterator[tuple[int, ...]]:
+    """Yield the groups of two or more among some vehicles of a fleet, by their places in `numbers`."""
+    for group in together:
+        some = tuple(n for n, number in enumerate(numbers) if number in group)
+        if len(some) > 1:
+            yield some
+
+
+def distances(
+    tube: Tube, lost: NDArray, other: tuple[Plan, NDArray], stop: NDArray, skew: float, *, far: float = np.inf
+) -> NDArray:
+    """Return the least distance from a tube to the column of another vehicle that brakes or flies on, (2, N) m.
+
+    `lost`, (N,) s, are own times of the vehicle when its link is lost; `other` are the plan and own times of the other.
+    Distances above `far`, m, are returned as that.
+    """
+    plan, own = other
+    trajectory = plan.trajectory
+    samples = places(trajectory, np.arange(0.0, trajectory.duration + _SAMPLE, _SAMPLE))
+    begin = np.round(np.clip(own, -_RESTS, _RESTS) / _SAMPLE).astype(np.int64)
+    per_sample = max(float(np.linalg.norm(np.diff(samples, axis=0), axis=1).max()), 1e-6)
+    found = _least(tube.boxes, tube.rows(lost), samples, per_sample, begin, _ways(tube, stop, skew, far))
+    return np.asarray(found - 0.5 * _SAMPLE * plan.limits.plan.speed - _BETWEEN)
+
+
+def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
+    begin = tube.part * np.arange(tube.boxes.shape[2]) - skew
+    end = begin + tube.part + 2.0 * skew
+    soonest, latest = NOTICED
+    first = np.stack([_braked(begin, soonest, stop, tube.rate), begin])
+    last = np.stack([_braked(end, latest, stop, tube.rate), end])
+    rest = np.array([[soonest + stop[-1] - skew, latest + stop[-1] + skew], [2.0 * _RESTS, 2.0 * _RESTS]])
+    return _Ways(
+        np.floor(first / _SAMPLE).astype(np.int64),
+        np.ceil(last / _SAMPLE).astype(np.int64),
+        np.stack([np.floor(rest[:, 0] / _SAMPLE), np.ceil(rest[:, 1] / _SAMPLE)], axis=1).astype(np.int64),
+        far,
+    )
+
+
+def _braked(times: NDArray, begins: float, stop: NDArray, rate: float) -> NDArray:
+    """Return how far a vehicle is along its plan, s, at times after a loss, if it begins to brake then."""
+    return np.asarray(np.minimum(times, begins) + np.interp(times - begins, np.arange(len(stop)) / rate, stop))
+
+
+@njit(nogil=True, error_model="numpy")
+def _least(boxes: NDArray, rows: NDArray, samples: NDArray, per_sample: float, begin: NDArray, ways: _Ways) -> NDArray:
+    """Return the least distances, (2, N) m, of boxes to samples, (W, 2), which are `per_sample`, m, apart at most."""
+    out = np.full((2, len(rows)), ways.far)
+    for n in range(len(rows)):
+        for way in range(boxes.shape[0]):
+            row = rows[n]
+            for part in range(boxes.shape[2]):
+                lies = boxes[way, row, part, 1, 2] <= 0.0
+                low, high = boxes[way, row, part, 0], boxes[way, row, part, 1]
+                box = low[0], low[1], high[0], high[1]
+                for reaction in range(2):
+                    first, last = ways.first[reaction, part], ways.last[reaction, part]
+                    if lies:
+                        first, last = ways.rest[reaction, 0], ways.rest[reaction, 1]
+                    first = min(max(begin[n] + first, 0), len(samples) - 1)
+                    last = min(max(begin[n] + last, 0), len(samples) - 1)
+                    least = out[reaction, n]
+                    out[reaction, n] = _nearest_sample(box, samples, per_sample, first, last, least)
+                if lies:
+                    break
+    return out
+
+
+@njit(error_model="numpy")
+def _nearest_sample(
+    box: tuple[float, float, float, float], samples: NDArray, per_sample: float, first: int, last: int, least: float
+) -> float:
+    """Return the least distance of a box, from x and y to x and y, to some of the samples, m, `least` at most.
+
+    Samples that cannot be nearer than what was found are passed over.
+    """
+    k = first
+    while k <= last:
+        a = max(box[0] - samples[k, 0], samples[k, 0] - box[2], 0.0)
+        b = max(box[1] - samples[k, 1], samples[k, 1] - box[3], 0.0)
+        away = np.sqrt(a * a + b * b)
+        if np.isnan(away) or np.isnan(least):
+            return np.nan
+        least = min(least, away)
+        k += 1 + int((away - least) / per_sample)
+    return least
+
+
+def tubes_apart(tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:
+    """Return the least distance, (N,) m, between the tubes of two vehicles that lose their links together.
+
+    Both own times, (N,) s, are those of one moment; by their clocks they differ by `skew`, s, at most.
+    """
+    late = int(np.ceil(skew * tube.rate))
+    rows = other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
+    return np.asarray(_least_of_tubes(tube.boxes[-1], tube.rows(own), other.boxes[-1], rows))
+
+
+@njit(nogil=True, error_model="numpy")
+def _least_of_tubes(boxes: NDArray, rows: NDArray, others: NDArray, rows_of_others: NDArray) -> NDArray:
+    """Return the least distances, (N,) m, of boxes, (R, S, 2, 3), to those of another vehicle.
+
+    Their last setpoints may be a period apart, so parts are compared with the next ones too.
+    """
+    out = np.full(len(rows), np.inf)
+    parts, parts_of_others = boxes.shape[1], others.shape[1]
+    for n in range(len(rows)):
+        for m in range(rows_of_others.shape[1]):
+            tube, other = boxes[rows[n]], others[rows_of_others[n, m]]
+            for part in range(max(parts, parts_of_others)):
+                for k in range(max(part - 1, 0), part + 2):
+                    away = _between_boxes(tube[min(part, parts - 1)], other[min(k, parts_of_others - 1)])
+                    if away < out[n] or np.isnan(away):
+                        out[n] = away
+    return out
+
+
+@njit(error_model="numpy")
+def _between_boxes(a: NDArray, b: NDArray) -> float:
+    """Return the distance of two boxes, (2, 3) each, seen from above, m."""
+    x = max(a[0, 0] - b[1, 0], b[0, 0] - a[1, 0], 0.0)
+    y = max(a[0, 1] - b[1, 1], b[0, 1] - a[1, 1], 0.0)
+    return np.sqrt(x * x + y * y)

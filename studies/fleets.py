@@ -1,0 +1,223 @@
+"""Coordinate random fleets in the shipped room, with and without regard to lost vehicles, and check them densely.
+
+Each fleet flies random min-snap paths, which are planned alone before. A fleet of fewer vehicles has the first paths of
+the largest one of the same seed. The checks share no code with the certificates: they compare the states of the plans
+over the skew, and fly drawn vehicles without link and poses beside the others, which brake.
+"""
+
+import itertools
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cfplan.errors import CfplanError
+from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
+from cfplan.flight.setpoints.stops import stop_motion
+from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.random_paths import generator, random_waypoints
+from cfplan.planning.fleet.coordination import Blocked, coordinate
+from cfplan.planning.fleet.fleet_file import APART, SKEW, FleetFile
+from cfplan.planning.fleet.lost import NOTICED
+from cfplan.planning.fleet.members import FleetMember
+from cfplan.planning.fleet.separation import separations
+from cfplan.planning.plan import plan
+from cfplan.planning.plan_result import Plan
+from cfplan.preparation.plan_fleet import loss_model
+from cfplan.preparation.plan_flight import PlannedFlight, give_way
+from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import check_space
+from cfplan.simulation.draws import draw_vehicles
+from cfplan.simulation.dry_run import fly_drawn, rehearsed_flight
+from studies.drawn_paths import WAYPOINTS
+from studies.runner.limits import limits_for
+from studies.runner.options import option
+from studies.runner.reductions import among, count, mean, quantile, smallest
+from studies.runner.result import Column, Table, table
+from studies.runner.study import Run, Study, Work
+
+_FROM_MARGIN = 0.05  # m that waypoints keep from the margin of the walls, as paths swing out between them
+_LONGEST = 4.0  # s from the last setpoint until every vehicle lies on the floor
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The fleets to coordinate, and how densely lost vehicles are flown."""
+
+    fleets: int = option(200, "Number of fleets of each size.", least=1)
+    sizes: tuple[int, ...] = option((2, 3, 4, 6), "Number of vehicles of a fleet.", least=2)
+    moments: int = option(12, "Moments at which each vehicle is lost in the check.", least=1)
+    seed: int = option(0, "Seed of the first fleet.", least=0)
+
+
+@dataclass(frozen=True, slots=True)
+class CoordinatedFleet:
+    """A fleet, coordinated without and with regard to lost vehicles; NaN where that was not possible."""
+
+    seed: int
+    vehicles: int
+    makespan: float  # of the slowest vehicle alone, without regard to lost vehicles
+    seconds: float  # of processor time: coordination and certificate
+    nearest: float  # m, of a pair, by the check
+    exposed: float  # fraction of the time for which a vehicle must not be lost, mean of the vehicles
+    lost_makespan: float
+    lost_seconds: float
+    lost_nearest: float  # m, of a lost vehicle and another, by the check
+
+    @property
+    def solved(self) -> bool:
+        """Return whether the vehicles keep apart."""
+        return bool(np.isfinite(self.makespan))
+
+    @property
+    def keeps_lost(self) -> bool:
+        """Return whether they also keep away from a lost one."""
+        return bool(np.isfinite(self.lost_makespan))
+
+
+COLUMNS = (
+    Column("vehicles", "vehicles", "", "d"),
+    Column("fleets", "fleets", value=count()),
+    Column("solved", "keep apart", of="fleets", value=count("solved")),
+    Column("makespan", "makespan", "", ".3f", meaning="mean; over the slowest vehicle alone",
+           value=among("solved", mean("makespan"))),
+    Column("seconds", "median", "s", ".1f", meaning="processor time, without that of the plans alone",
+           value=quantile("seconds", 0.5)),
+    Column("nearest", "nearest", "m", ".3f", meaning="of all pairs, by the dense check over the skew",
+           value=among("solved", smallest("nearest"))),
+    Column("exposed", "exposed", "%", ".0f", meaning="mean; fraction of the time at which a lost vehicle may come too "
+           "near to another", value=among("solved", mean("exposed"))),
+    Column("keeps_lost", "also keep clear of the lost", of="fleets", value=count("keeps_lost")),
+    Column("lost_makespan", "makespan then", "", ".2f", meaning="mean; over the slowest vehicle alone",
+           value=among("keeps_lost", mean("lost_makespan"))),
+    Column("lost_seconds", "median then", "s", ".1f", value=quantile("lost_seconds", 0.5)),
+    Column("lost_nearest", "nearest lost", "m", ".3f", meaning="of drawn vehicles without link and poses to the others "
+           "that brake", value=among("keeps_lost", smallest("lost_nearest"))),
+)  # fmt: skip
+
+
+def work(settings: Settings, run: Run) -> Work:
+    """Return one case per seed: its fleets of all sizes."""
+    seeds = range(settings.seed, settings.seed + settings.fleets)
+    cases = {f"fleet {seed}": (seed, settings.sizes, settings.moments) for seed in seeds}
+    return Work(cases, partial(measure, limits=limits_for(Path())), CoordinatedFleet)
+
+
+def measure(case: tuple[int, Sequence[int], int], limits: Limits) -> list[CoordinatedFleet]:
+    """Plan the paths of a seed alone, and coordinate fleets of the first of them."""
+    seed, sizes, moments = case
+    members = list(itertools.islice(_members(seed, limits), max(sizes)))
+    return [_coordinated(seed, members[:size], limits, moments) for size in sizes]
+
+
+def _members(seed: int, limits: Limits) -> Iterator[FleetMember]:
+    """Yield vehicles on random paths, whose starts and whose ends are apart."""
+    distance = limits.space.margin + _FROM_MARGIN
+    box = np.array([limits.space.low, limits.space.high]) + np.array([[distance], [-distance]])
+    ends: list[NDArray] = []
+    for number in itertools.count():
+        with suppress(CfplanError):  # the path leaves the space between its waypoints, or has no flight
+            path = min_snap(random_waypoints(np.random.SeedSequence([seed, number]), box, WAYPOINTS))
+            check_space(path, limits.space)
+            both = path(np.array([0.0, path.end]))[:, :2]
+            if all((np.linalg.norm(both - other, axis=1) >= APART).all() for other in ends):
+                planned = give_way(plan(path, limits.airframe, limits))[0]
+                ends.append(both)
+                yield FleetMember(f"v{len(ends)}", planned)
+
+
+def _coordinated(seed: int, alone: Sequence[FleetMember], limits: Limits, moments: int) -> CoordinatedFleet:
+    model = loss_model(FleetFile("", (), APART, SKEW), limits)
+    longest = max(member.end for member in alone)
+    numbers = range(len(alone))
+
+    begun = time.process_time()
+    apart = coordinate(alone, APART, SKEW, _given_way)
+    seconds = time.process_time() - begun
+    nearest = exposed = makespan = lost_makespan = lost_nearest = np.nan
+    if not isinstance(apart, Blocked):
+        begun = time.process_time()
+        separations(apart, SKEW)
+        seconds += time.process_time() - begun
+        makespan = max(each.end for each in apart) / longest
+        nearest = min(_apart(a, b) for a, b in itertools.combinations(apart, 2))
+        exposed = float(np.mean([each.exposed for each in model.losses(apart, numbers, SKEW)]))
+
+    begun = time.process_time()
+    clear = coordinate(alone, APART, SKEW, _given_way, model)
+    lost_seconds = time.process_time() - begun
+    if not isinstance(clear, Blocked):
+        lost_makespan = max(each.end for each in clear) / longest
+        lost_nearest = _nearest_lost(clear, limits, moments, seed)
+    return CoordinatedFleet(
+        seed, len(alone), makespan, seconds, nearest, exposed, lost_makespan, lost_seconds, lost_nearest
+    )  # fmt: skip
+
+
+def _given_way(planned: Plan) -> Plan:
+    return give_way(planned)[0]
+
+
+def _apart(a: FleetMember, b: FleetMember) -> float:
+    """Return the least distance of two vehicles, m, by the states of their plans at every 4 ms and seven skews."""
+    times = np.arange(0.0, max(a.end, b.end) + 0.1, 0.004)
+    of_a = _positions(a, times)
+    skews = np.linspace(-SKEW, SKEW, 7)
+    return min(float(np.linalg.norm(of_a - _positions(b, times + late), axis=1).min()) for late in skews)
+
+
+def _positions(member: FleetMember, times: NDArray) -> NDArray:
+    trajectory = member.plan.trajectory
+    return np.asarray(trajectory.at(np.clip(times - member.delay, 0.0, trajectory.duration)).position[:, :2])
+
+
+def _nearest_lost(members: Sequence[FleetMember], limits: Limits, moments: int, seed: int) -> float:
+    """Lose link and poses of each vehicle at some moments, one drawn vehicle each; return the nearest to another, m."""
+    encoded = [encode_flight(PlannedFlight(each.name, each.plan, limits)) for each in members]
+    random, least = generator(seed), np.inf
+    for i, lost in enumerate(members):
+        flight = rehearsed_flight(encoded[i], lost.plan.trajectory)
+        draws = draw_vehicles(limits.airframe, limits.pose, moments)
+        for moment, draw in zip(np.linspace(0.0, lost.plan.trajectory.duration, moments), draws, strict=True):
+            own = round(float(moment) * RATE) / RATE
+            flown = fly_drawn(replace(flight, duration=own + _LONGEST), draw, limits, own)
+            way = flown.position[round(1000 * own) :: 10]
+            down = np.flatnonzero(way[:, 2] <= limits.space.low[2])
+            way = way[: down[0] + 1, :2] if len(down) else way[:, :2]
+            for j, other in enumerate(members):
+                if j != i:
+                    begins = float(random.uniform(*NOTICED))
+                    braking = _braking(other, encoded[j], lost.delay + own, begins)
+                    least = min(least, _least(way, braking))
+    return float(least)
+
+
+def _braking(member: FleetMember, encoded: EncodedFlight, loss: float, begins: float) -> NDArray:
+    """Return the places, (M, 2) m at each setpoint after a loss, of a vehicle that begins to brake then."""
+    motion = encoded.motion
+    own = np.round((loss - member.delay) * RATE) + np.arange(round(begins * RATE) + 1)
+    rows = np.clip(own, 0, len(motion.position) - 1).astype(int)
+    stop, _ = stop_motion(motion, rows[-1:], RATE)
+    return np.concatenate([motion.position[rows[:-1]], stop.position])[:, :2]
+
+
+def _least(way: NDArray, others: NDArray) -> float:
+    """Return the least distance while the first is in the air, and from where it lies to where the other rests, m."""
+    ticks = np.arange(max(len(way), len(others)))
+    away = np.linalg.norm(way[np.minimum(ticks, len(way) - 1)] - others[np.minimum(ticks, len(others) - 1)], axis=1)
+    return float(min(away[: len(way)].min(), away[-1]))
+
+
+def tables(settings: Settings, rows: list[Any]) -> Iterator[Table]:
+    """Yield a table with one row per number of vehicles."""
+    yield table("fleets", f"Random fleets, {APART:g} m apart", COLUMNS, rows, by=("vehicles",))
+
+
+STUDY = Study(Settings, work, tables, "--fleets 40 -o results/fleets.json")
