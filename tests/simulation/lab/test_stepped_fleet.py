@@ -200,10 +200,9 @@ def test_swapped_bodies_are_noticed_while_one_vehicle_takes_off():
     assert_down(flight)
 
 
-def test_a_vehicle_among_others_flies_as_one_alone():
+def test_a_vehicle_among_others_flies_as_one_alone(whole_flight):
     """Until the conductor makes it wait, to the last bit: sharing a clock changes nothing."""
-    fleet = fleet_of()
-    shared = fleet.fly().telemetry["left"]
+    shared = whole_flight.telemetry["left"]
     alone = fly_stepped(MISSIONS["left"], lab=SteppedLab(LIMITS.airframe, vehicle=OWN["left"])).telemetry
     armed = next(message for message in alone if isinstance(message, PhaseEntered) and message.phase is Phase.ARM)
     assert [each for each in shared if each.time < armed.time] == [each for each in alone if each.time < armed.time]
