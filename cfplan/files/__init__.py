@@ -1,6 +1,6 @@
 """Text formats: YAML whose mistakes are reported with their place, tables of numbers, and values as JSON knows them.
 
-And where files are: the nearest of a name above a folder, what comes with cfplan, and new ones, whole or not at all.
+And where files are: the nearest of a name above a folder, what comes with cfplan, and atomic writing of new ones.
 """
 
 __all__ = ["atomic", "json_values", "nearest", "shipped", "text", "yaml_with_places"]

@@ -30,7 +30,9 @@ SPACING = (
     0.25  # s between knots of a correction; faster than 2 Hz nothing is learned (docs/flying.md has what that buys)
 )
 LARGEST = 0.2  # m, a vehicle that strays farther is not what its airframe says
-HOVER = 0.5  # s at the end of the path that count as the flight does, as there the vehicle goes on hovering
+# s of hover after the end that count as the flight does, about as long as the pilot holds it. The shift at the end is
+# held there too, while a vehicle that lagged by 4 cm comes up within half a second and would be off by all of it.
+HOVER = 1.5
 _ENOUGH = 3  # flights that tell what repeats from what does not
 _CHANCE = 2.0  # times the variance that chance explains: more than that repeats
 _FLOWN_HINT = "name records of flights that flew the whole plan and landed"

@@ -61,8 +61,15 @@ def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits)
         glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation, gaps.deviation[:, begin:]
     )
     flown, later = held.motion, held.motion.since(begin / RATE)
-    at_once = fly_motion(encode_trajectory(flown, space=limits.space), flown, limits.airframe)
-    gone_on = fly_motion(encode_trajectory(later, space=limits.space), later, limits.airframe, snapshot=believed)
+    at_once = fly_motion(
+        encode_trajectory(flown, gains=gains_under(limits), space=limits.space), flown, limits.airframe
+    )
+    gone_on = fly_motion(
+        encode_trajectory(later, gains=gains_under(limits), space=limits.space),
+        later,
+        limits.airframe,
+        snapshot=believed,
+    )
     rows = slice(begin * 10, begin * 10 + 2000)
     np.testing.assert_allclose(gone_on.position[:2000], at_once.position[rows], atol=1e-5)
 

@@ -121,7 +121,7 @@ def test_the_second_flight_stays_nearer_to_the_plan_and_the_third_no_farther(pat
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("path", ["slalom", "random", "trefoil"])
+@pytest.mark.parametrize("path", ["slalom", "random", "trefoil", "line"])
 def test_second_flights_of_fast_paths_stay_nearer(patched, cfplan, tmp_path, without_moment, path):
     words = REPOSITORY / "flights" / f"{path}.yaml", "--safety", without_moment
     figures, _ = fly_three_times(cfplan, tmp_path / "records", *words)

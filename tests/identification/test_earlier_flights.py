@@ -6,6 +6,7 @@ import pytest
 from cfplan.errors import InputError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.identification.earlier_flights import HOVER, LARGEST, EarlierFlight, learn_correction
+from cfplan.recording.summary import SETTLED
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.correction import PlanCorrection, corrected
 from cfplan.vehicle.trajectory import Trajectory
@@ -65,6 +66,17 @@ def test_a_corrected_flight_teaches_the_same_as_the_first(planned):
         learned = learn_correction(flights)
         assert np.abs(left(planned, learned)).max() < 0.003
         assert learned.before < 0.008
+
+
+def test_a_vehicle_that_lags_and_comes_up_in_the_hover_stays_near_before_and_after(planned):
+    """As with more drag than its airframe has; the shift at the end is held while the vehicle comes up."""
+    times = np.arange(0.0, planned.duration + 1.5, 0.01)
+    share = np.minimum(times, 1.0) * np.exp(-2.0 * np.maximum(times - planned.duration, 0.0))
+    lag = -0.05 * share[:, None] * [1.0, 0.0, 0.0]
+    flight = EarlierFlight("records/there", planned, planned, times, planned.path(planned.s_at(times)) + lag)
+    off = np.linalg.norm(lag + learn_correction([flight]).correction.at(times)[:, 0], axis=1)
+    assert off[times < planned.duration - 1.0].max() < 0.015
+    assert off.max() < SETTLED
 
 
 def test_more_flights_bring_the_correction_nearer_to_what_repeats(planned):

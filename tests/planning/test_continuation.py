@@ -43,7 +43,7 @@ def continued_soon(trajectory, leave, *given, **options):
     raise NoWayError("from no joint")
 
 
-@pytest.mark.parametrize("share", [0.05, 0.3, 0.55, 0.75])
+@pytest.mark.parametrize("share", [0.05, 0.35, 0.55, 0.75])
 @pytest.mark.parametrize("yaw", YawMode)
 def test_a_new_plan_goes_on_without_a_jump_and_is_certified(flown, limits, share, yaw):
     leave = share * flown.trajectory.duration

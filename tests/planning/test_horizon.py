@@ -61,7 +61,7 @@ def costs(seeds, limits) -> np.ndarray:
 
 def test_knowing_three_waypoints_costs_little(wide):
     at_once, known = costs(range(3), wide).sum(axis=0)
-    assert known < 1.03 * at_once
+    assert known < 1.05 * at_once
 
 
 @pytest.mark.slow

@@ -75,9 +75,7 @@ def check_hover(loop: FlightLoop) -> None:
         return
     seen = measure_hover(statuses, (estimates[0], estimates[-1]), airframe)
     if not (math.isfinite(seen.thrust_scale) and math.isfinite(seen.battery_voltage)):
-        add_event(
-            Level.WARNING, "hover: the thrust scale is not known, as the log holds no motor commands or no voltage"
-        )
+        add_event(Level.WARNING, "hover: the thrust scale is not known: the log has no motor commands or no voltage")
         return
     add_event(Level.INFO, f"hover: thrust scale {seen.thrust_scale:.3f}, battery {seen.battery_voltage:.2f} V")
     _require_certified(seen, airframe, loop.limits.plan)

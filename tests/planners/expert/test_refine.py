@@ -91,7 +91,7 @@ def test_a_boundary_state_is_kept():
 
 
 @pytest.mark.parametrize("yaw", [YawMode.FIXED, YawMode.FREE])
-@pytest.mark.parametrize("seed", [1, 3, 4])
+@pytest.mark.parametrize("seed", [2, 3, 4])
 def test_from_a_boundary_state_too_the_search_begins_at_the_given_profile(yaw, seed):
     path, chosen, expert = planned("hardware", seed)
     first, last = 30, 100
