@@ -22,6 +22,16 @@ def test_a_fleet_is_planned_and_its_pairs_are_certified(cfplan, fleet_file, safe
     assert all(each["certificate"]["passed"] for each in document["vehicles"])
 
 
+def test_the_figure_of_a_fleet_has_its_paths_distances_and_conflict_map(cfplan, fleet_file, safety_file, tmp_path):
+    words = ("plan", fleet_file, "--safety", safety_file(), "--figure", tmp_path / "fleet.svg")
+    ended = cfplan(*words)
+    assert ended.code == 0
+    drawn = (tmp_path / "fleet.svg").read_text()
+    for text in ("from above", "distance of each pair", "conflict maps"):
+        assert text in drawn
+    assert "--force" in cfplan(*words).err
+
+
 def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     ended = cfplan("check", fleet_file, "--safety", safety_file())
     assert ended.code == 0
@@ -33,7 +43,7 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
 @pytest.mark.parametrize(
     ("command", "words", "what"),
     [
-        ("plan", ["-o", "a.parquet"], "plan files and figures are not supported"),
+        ("plan", ["-o", "a.parquet"], "plan files are not supported"),
         ("fly", ["--records", "."], "not flown yet"),
         ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
     ],
