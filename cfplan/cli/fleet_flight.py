@@ -21,17 +21,16 @@ from cfplan.flight.telemetry import Event, Level, Phase, PhaseEntered, Telemetry
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.plan_file import save_plan
-from cfplan.preparation.plan_fleet import PlannedFleet, plan_fleet
-from cfplan.preparation.plan_flight import PlannedFlight
-from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
-from cfplan.preparation.slow_motion import require_harmless_slow_motion
+from cfplan.preparation.plan_fleet import PlannedFleet, plan_fleet, prepare_fleet
+from cfplan.preparation.prepare_flight import PreparedFlight
+from cfplan.recording.fleet_record import write_fleet_file
 from cfplan.recording.header import header_of_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE
 from cfplan.recording.summary import FlightSummary, summarise
 from cfplan.recording.writer import RecordWriter, new_record_folder, wall_time_at_zero, write_summary
 from cfplan.simulation.lab.sim_driver import SimDriver
-from cfplan.steering.virtual_room import VehiclePlace, VirtualRoom, virtual_addresses
+from cfplan.steering.fleet_room import FleetRoom, VehiclePlace, virtual_addresses
 
 _SHOWN = (Phase.ARM, Phase.TAKE_OFF, Phase.STREAM, Phase.LAND)
 
@@ -43,6 +42,7 @@ class _Vehicle:
     member: FleetMember
     prepared: PreparedFlight
     place: VehiclePlace
+    source: Path  # its path file
     folder: Path  # of its record
 
     @property
@@ -60,14 +60,17 @@ def fly_fleet(
     with ExitStack() as starting:
         pilots = {name: starting.enter_context(start_pilot([SimDriver])) for name in addresses}
         fleet = plan_fleet(fleet_file, limits, options.flight_options(planning, safety_file, file), steps)
-        prepared = [_prepared(flight, steps) for flight in fleet.flights]
+        prepared = prepare_fleet(fleet, steps)
         folder = new_record_folder(records, fleet.name)
         vehicles = []
-        for member, each in zip(fleet.members, prepared, strict=True):
+        for member, each, listed in zip(fleet.members, prepared, fleet_file.vehicles, strict=True):
             (x, y, _), yaw = each.mission.start
             place = VehiclePlace(addresses[member.name], bodies[member.name], (x, y), yaw)
-            vehicles.append(_Vehicle(member, each, place, new_record_folder(folder, member.name)))
-        outcome = _fly(vehicles, fleet, file, pilots, steps)
+            vehicles.append(
+                _Vehicle(member, each, place, listed.path_file.source, new_record_folder(folder, member.name))
+            )
+        write_fleet_file(folder, fleet.name, fleet.apart, {vehicle.name: vehicle.folder for vehicle in vehicles})
+        outcome = _fly(vehicles, fleet, pilots, steps)
     _report(vehicles, outcome, folder, _summarised(vehicles, outcome), steps)
     return int(outcome.exit_code)
 
@@ -83,25 +86,13 @@ def _bodies(fleet: FleetFile) -> dict[str, str]:
     return found
 
 
-def _prepared(flight: PlannedFlight, steps: Steps) -> PreparedFlight:
-    """Encode and rehearse the flight of a vehicle, and certify its stops. Raises NotCertifiedError."""
-    steps.say(f"  {flight.name}")
-    encoded = encode_flight(flight, steps)
-    rehearsed, lost = rehearse(flight, encoded, steps), find_link_loss(encoded, flight.limits, steps)
-    mission, stops = make_mission(encoded, flight.limits, steps)
-    require_harmless_slow_motion(mission, steps)
-    return PreparedFlight(flight, encoded, rehearsed, lost, stops, mission)
-
-
-def _fly(
-    vehicles: list[_Vehicle], fleet: PlannedFleet, file: Path, pilots: dict[str, PilotProcess], steps: Steps
-) -> FleetOutcome:
+def _fly(vehicles: list[_Vehicle], fleet: PlannedFleet, pilots: dict[str, PilotProcess], steps: Steps) -> FleetOutcome:
     """Fly in a virtual room, and record each vehicle."""
     with ExitStack() as stack:
         with steps.step("lab") as results:
-            room = stack.enter_context(VirtualRoom([vehicle.place for vehicle in vehicles], fleet.limits))
+            room = stack.enter_context(FleetRoom([vehicle.place for vehicle in vehicles], fleet.limits))
             results.append(f"{len(vehicles)} virtual Crazyflies in one room")
-        writers = {vehicle.name: stack.enter_context(_writer(vehicle, file)) for vehicle in vehicles}
+        writers = {vehicle.name: stack.enter_context(_writer(vehicle)) for vehicle in vehicles}
         keyboard = stack.enter_context(Keyboard())
         shown = _Shown(steps)
 
@@ -126,12 +117,12 @@ def _fly(
         )
 
 
-def _writer(vehicle: _Vehicle, file: Path) -> RecordWriter:
+def _writer(vehicle: _Vehicle) -> RecordWriter:
     """Return the writer of a vehicle's record, beside its plan."""
     plan, name = vehicle.prepared.plan, vehicle.name
-    save_plan(plan, vehicle.folder / PLAN_FILE, {"name": name, "path file": str(file)})
+    save_plan(plan, vehicle.folder / PLAN_FILE, {"name": name, "path file": str(vehicle.source)})
     header = header_of_plan(
-        plan, name=name, uri=vehicle.place.uri, source=file, wall_time_at_zero=wall_time_at_zero(), uncorrected=None
+        plan, name=name, uri=vehicle.place.uri, source=vehicle.source, wall_time_at_zero=wall_time_at_zero()
     )
     return RecordWriter(vehicle.folder, header)
 
@@ -151,7 +142,7 @@ class _Shown:
     def _say(self, time: float, name: str, text: str) -> None:
         if math.isnan(self._began):
             self._began = time
-        self._steps.say(f"  {time - self._began:6.2f} s  {name}: {text}")
+        self._steps.print(f"  {time - self._began:6.2f} s  {name}: {text}")
 
 
 def _summarised(vehicles: list[_Vehicle], outcome: FleetOutcome) -> dict[str, FlightSummary]:
@@ -186,7 +177,7 @@ def _report(
         print_table("Fleet", columns, table)
         click.echo(f"nearest, as measured: {_text(outcome.nearest, 1.0, 'm')} between columns")
         click.echo(f"records: {folder}")
-        click.echo(f"replay: cfplan replay {shlex.quote(str(vehicles[0].folder))}")
+        click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
     if outcome.exit_code is not ExitCode.OK:
         click.echo(f"{styled('error:', 'red')} {outcome.brakes}", err=True)
 

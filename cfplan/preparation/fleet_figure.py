@@ -32,16 +32,16 @@ def draw_fleet(fleet: PlannedFleet) -> "Figure":
     pairs = [(a, b, _near(a, b, fleet.apart)) for a, b in itertools.combinations(fleet.members, 2)]
     conflicts = [(a, b, near) for a, b, near in pairs if near.any()]
     figure = Figure(figsize=(11.0 if conflicts else 6.5, 6.5), layout="constrained")
-    left = figure
-    if conflicts:
-        left, right = figure.subfigures(1, 2, width_ratios=(1.25, 1.0))
+    left, right = (
+        np.asarray(figure.subfigures(1, 2, width_ratios=(1.25, 1.0))).tolist() if conflicts else (figure, None)
+    )
+    if right is not None:
         columns = int(np.ceil(np.sqrt(len(conflicts))))
         maps = right.subplots(-(-len(conflicts) // columns), columns, squeeze=False).ravel()
-        for axes, conflict in itertools.zip_longest(maps, conflicts):
-            if conflict is None:
-                axes.remove()
-            else:
-                _draw_map(axes, *conflict, end)
+        for axes, (a, b, near) in zip(maps, conflicts, strict=False):
+            _draw_map(axes, a, b, near, end)
+        for axes in maps[len(conflicts) :]:
+            axes.remove()
         right.suptitle(f"conflict maps: nearer than {fleet.apart:g} m where filled; time on each plan, s", fontsize=9)
     above, over = left.subplots(2, 1, height_ratios=(1.6, 1.0))
     _draw_room(above, space)
@@ -73,7 +73,9 @@ def _draw_room(axes: "Axes", space: Space) -> None:
     along = [wide, 1 - wide]
     low, high = np.array(space.low)[along], np.array(space.high)[along]
     for inset, style in ((0.0, {"lw": 1.4}), (space.margin, {"lw": 0.8, "ls": "--"})):
-        axes.add_patch(Rectangle(low + inset, *(high - low - 2 * inset), fill=False, ec="0.35", **style))
+        axes.add_patch(
+            Rectangle((low[0] + inset, low[1] + inset), *(high - low - 2 * inset), fill=False, ec="0.35", **style)
+        )
     for obstacle in space.obstacles:
         axes.fill(*outline(obstacle)[:, along].T, color=OBSTACLE, lw=0.0)
     axes.set(xlim=(low[0] - 0.3, high[0] + 0.3), ylim=(low[1] - 0.3, high[1] + 0.3), aspect="equal")

@@ -15,7 +15,8 @@ from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import Separation, separations
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
-from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, rehearse
+from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
+from cfplan.preparation.slow_motion import require_harmless_slow_motion
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
@@ -159,3 +160,18 @@ def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[
             lost = find_link_loss(encoded, fleet.limits)
             (results.append if inside(lost.beyond) else results.warn)(str(lost))
     return dry_runs
+
+
+def prepare_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> tuple[PreparedFlight, ...]:
+    """Do what prepare_flight() does with the plan of each vehicle. Raises NotCertifiedError where one does not pass."""
+    prepared = []
+    for flight in fleet.flights:
+        with step(on_step, flight.name) as results:
+            encoded = encode_flight(flight)
+            rehearsed, lost = rehearse(flight, encoded), find_link_loss(encoded, fleet.limits)
+            mission, stops = make_mission(encoded, fleet.limits)
+            require_harmless_slow_motion(mission)
+            results.append(f"{len(encoded.payloads)} setpoints, deviation {rehearsed.expected()}, a stop from each")
+            (results.append if inside(lost.beyond) else results.warn)(str(lost))
+        prepared.append(PreparedFlight(flight, encoded, rehearsed, lost, stops, mission))
+    return tuple(prepared)

@@ -83,7 +83,7 @@ class FleetRecord:
 
     def pair_rows(self) -> list[tuple[str, ...]]:
         """Return a row of text per pair, the nearest first: names, least distance, that planned, time, place."""
-        rows = []
+        rows: list[tuple[str, ...]] = []
         for pair in sorted(self.pairs(), key=lambda each: np.fmin.reduce(each.distance, initial=np.inf)):
             row, names = pair.nearest, " – ".join(pair.pair)
             if row is None:

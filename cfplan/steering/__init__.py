@@ -2,6 +2,7 @@
 
 __all__ = [
     "connect",
+    "fleet_room",
     "flight_in_progress",
     "real_time_steering",
     "recertify",
@@ -9,6 +10,5 @@ __all__ = [
     "starting_vehicle",
     "steered_vehicle",
     "stepped_steering",
-    "virtual_room",
     "waypoint_lines",
 ]

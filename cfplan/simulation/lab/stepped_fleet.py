@@ -30,6 +30,7 @@ from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_vicon.faults import Seen
 
 PERIOD = 0.01  # s between looks of the room and of the conductor
+_SETTLING = 0.1  # s until a supervisor reports that its vehicle was disarmed
 _AFTERWARDS = 6.0  # s that vehicles get to come to rest after the last pilot has ended
 _FLYING = (State.FLYING, State.WARNING_LEVEL_OUT)
 Message = PilotMessage | FlightEnded | Telemetry
@@ -210,6 +211,7 @@ class SteppedFleet:
                 self._heard.append((name, end))
             while len(self._notes.ends) < len(self.labs):
                 lab.clock.sleep(PERIOD)
+            lab.clock.sleep(_SETTLING)
             until = lab.now + _AFTERWARDS
             while lab.vehicle.supervisor.state in _FLYING and lab.now < until:
                 lab.clock.sleep(PERIOD)

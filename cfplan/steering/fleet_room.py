@@ -50,7 +50,7 @@ def virtual_addresses(fleet: FleetFile) -> dict[str, str]:
     return found
 
 
-class VirtualRoom:
+class FleetRoom:
     """A running lab with a vehicle at each place; a context manager. Raises what starting a lab raises."""
 
     def __init__(self, places: Sequence[VehiclePlace], limits: Limits):
@@ -85,7 +85,7 @@ class VirtualRoom:
         self._variables[name] = os.environ.get(name)
         os.environ[name] = f"127.0.0.1:{port}"
 
-    def __enter__(self) -> "VirtualRoom":
+    def __enter__(self) -> "FleetRoom":
         return self
 
     def __exit__(
