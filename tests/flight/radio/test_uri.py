@@ -34,7 +34,7 @@ BAD = {
     "udp://127.0.0.1": "its port",
     "udp://:19850": "its port",
     "udp://127.0.0.1:70000": "its port",
-    "usb://": "number of the vehicle",
+    "usb://": "number of the USB device",
     "sim://nonsense": "no such virtual vehicle",
 }
 
