@@ -30,19 +30,28 @@ def refuse_flight_options(given: Mapping[str, bool]) -> None:
             )
 
 
-def refuse_output(output: Path | None, figure: Path | None) -> None:
-    """Raise InputError for output files, each of which holds the plan of one vehicle."""
-    if output is not None or figure is not None:
+def refuse_output(output: Path | None) -> None:
+    """Raise InputError for a plan file, which holds the plan of one vehicle."""
+    if output is not None:
         raise InputError(
-            "plan files and figures are not supported for fleets",
-            where=str(output or figure),
-            hint="omit -o and --figure; --json prints starts, ends and distances",
+            "plan files are not supported for fleets",
+            where=str(output),
+            hint="omit -o; --json prints starts, ends and distances",
         )
 
 
-def plan_and_print(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> None:
-    """Plan a fleet, and print who starts when and how near each pair comes."""
+def plan_and_print(
+    file: Path, safety_file: Path | None, planning: dict[str, Any], figure: Path | None, force: bool, steps: Steps
+) -> None:
+    """Plan a fleet, draw it in a figure if one is named, and print who starts when and how near each pair comes."""
     fleet = _planned(file, safety_file, planning, steps)
+    if figure is not None:
+        from cfplan.planning.figure import save_figure
+        from cfplan.preparation.fleet_figure import draw_fleet
+
+        with steps.step("figure") as results:
+            save_figure(draw_fleet(fleet), figure, overwrite=force)
+            results.append(str(figure))
     if steps.as_json:
         print_json(fleet.to_dict())
     else:

@@ -23,6 +23,7 @@ from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.plan_file import save_plan
 from cfplan.preparation.plan_fleet import PlannedFleet, plan_fleet, prepare_fleet
 from cfplan.preparation.prepare_flight import PreparedFlight
+from cfplan.recording.fleet_record import write_fleet_file
 from cfplan.recording.header import header_of_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE
@@ -68,6 +69,7 @@ def fly_fleet(
             vehicles.append(
                 _Vehicle(member, each, place, listed.path_file.source, new_record_folder(folder, member.name))
             )
+        write_fleet_file(folder, fleet.name, fleet.apart, {vehicle.name: vehicle.folder for vehicle in vehicles})
         outcome = _fly(vehicles, fleet, pilots, steps)
     _report(vehicles, outcome, folder, _summarised(vehicles, outcome), steps)
     return int(outcome.exit_code)
@@ -175,7 +177,7 @@ def _report(
         print_table("Fleet", columns, table)
         click.echo(f"nearest, as measured: {_text(outcome.nearest, 1.0, 'm')} between columns")
         click.echo(f"records: {folder}")
-        click.echo(f"replay: cfplan replay {shlex.quote(str(vehicles[0].folder))}")
+        click.echo(f"replay: cfplan replay {shlex.quote(str(folder))}")
     if outcome.exit_code is not ExitCode.OK:
         click.echo(f"{styled('error:', 'red')} {outcome.brakes}", err=True)
 

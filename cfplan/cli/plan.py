@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     epilog="""\b
 Examples:
   cfplan plan flights/circle.yaml -o circle.parquet
-  cfplan plan flights/fleets/two.yaml""",
+  cfplan plan flights/fleets/two.yaml --figure fleet.png""",
 )
 @options.path_file
 @options.planning
@@ -42,10 +42,12 @@ def plan(
     how near each pair comes.
     """
     steps = Steps(as_json=as_json)
-    if fleet.is_fleet(path_file):
-        fleet.refuse_output(output, figure)
-        return fleet.plan_and_print(path_file, safety_file, planning, steps)
+    is_fleet = fleet.is_fleet(path_file)
+    if is_fleet:
+        fleet.refuse_output(output)
     _check_files(output, figure, force)
+    if is_fleet:
+        return fleet.plan_and_print(path_file, safety_file, planning, figure, force, steps)
     limits = options.read_limits(safety_file, path_file, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate

@@ -51,7 +51,12 @@ Examples:
 @click.option("--png", type=click.Path(path_type=Path), help="Picture of the view to write; needs no screen.")
 @click.option("--figure", type=click.Path(path_type=Path), help="Figure of a record to write: .png, .pdf or .svg.")
 @click.option("--gif", type=click.Path(path_type=Path), help="GIF to write: a record's flight along its path.")
-@click.option("--at", "moment", type=float, help="Time of the picture, s.  [default: the middle of the path]")
+@click.option(
+    "--at",
+    "moment",
+    type=float,
+    help="Time of the picture, s.  [default: the middle of the path; of a fleet, where two are nearest]",
+)
 @click.option("--force", is_flag=True, help="Overwrite the file.")
 @options.as_json
 def replay(
@@ -71,19 +76,24 @@ def replay(
     """Replay a FLIGHT in rerun, or several as trials in one view.
 
     Each is a record (its folder, or its flight.mcap) or a log of motion capture: Vicon CSV, a Crazyflie's microSD log,
-    CSV of t, x, y, z, a ROS bag, or a MAVLink .tlog. The flights in a folder of records are listed.
+    CSV of t, x, y, z, a ROS bag, or a MAVLink .tlog. The folder of a fleet's flight shows all its vehicles. The flights
+    in a folder of records are listed.
     """
     from cfplan.cli.flights_list import flights_in, print_flights
+    from cfplan.recording.fleet_record import is_fleet_record
     from cfplan.recording.reader import is_record
 
-    if len(flights) == 1 and (records := flights_in(flights[0])):
+    one_fleet = len(flights) == 1 and plan_file is None and is_fleet_record(flights[0])
+    if not one_fleet and len(flights) == 1 and (records := flights_in(flights[0])):
         print_flights(records, as_json=as_json)
         return
     steps = Steps(as_json=as_json)
     files = Files(save, png, figure, gif, moment, force)
     one_record = len(flights) == 1 and plan_file is None and is_record(flights[0])
     files.check(one_record=one_record)
-    if one_record:
+    if one_fleet:
+        document = _replay_fleet(flights[0], files, steps)
+    elif one_record:
         document = _replay_record(flights[0], files, steps)
     else:
         reference = _reference(plan_file, safety_file, steps)
@@ -175,6 +185,15 @@ def _replay_record(place: Path, files: Files, steps: Steps) -> dict[str, Any]:
             results.append(f"{files.gif} ({_size(files.gif)})")
     files.make(steps, partial(write_rrd, flight), partial(picture, flight), partial(show, flight))
     return {"record": str(place), **(summarise(flight).to_json() if steps.as_json else {})}
+
+
+def _replay_fleet(folder: Path, files: Files, steps: Steps) -> dict[str, Any]:
+    from cfplan.cli.recorded_fleet import read_fleet
+    from cfplan.recording.rerun.fleet_view import picture_fleet, show_fleet, write_fleet
+
+    fleet = read_fleet(folder, steps)
+    files.make(steps, partial(write_fleet, fleet), partial(picture_fleet, fleet), partial(show_fleet, fleet))
+    return {"record": str(folder), **fleet.to_json()}
 
 
 def _reference(plan_file: Path | None, safety_file: Path | None, steps: Steps) -> "Reference | None":

@@ -3,6 +3,7 @@
 __all__ = [
     "animation",
     "commitments",
+    "fleet_record",
     "flight_figure",
     "header",
     "importers",

@@ -24,6 +24,7 @@ from cfplan.safety.limits import PlanLimits
 UNKNOWN = "–"
 SETTLED = 0.03  # m from the end of the path: close enough to call the flight settled
 SPEED_SPAN = 0.06  # s over which poses tell speed: 1 mm of noise is 0.02 m/s
+_ALMOST = 0.1  # s before a plan's end, from when on packets may show a hover, with which a stream on board ends
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
 
@@ -228,7 +229,7 @@ def finished(record: Record) -> bool:
         return False
     period = float(np.median(np.diff(due)))
     last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
-    least = committed_time(record) - 3 * period
+    least = committed_time(record) - _ALMOST
     return bool(due[-1] - due[0] >= least and last * period >= least)
 
 

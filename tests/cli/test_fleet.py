@@ -69,6 +69,16 @@ def test_the_vehicles_of_one_dongle_are_lost_together(cfplan, narrow_fleet, safe
     assert together[0]["distance"] < 0.2
 
 
+def test_the_figure_of_a_fleet_has_its_paths_distances_and_conflict_map(cfplan, fleet_file, safety_file, tmp_path):
+    words = ("plan", fleet_file, "--safety", safety_file(), "--figure", tmp_path / "fleet.svg")
+    ended = cfplan(*words)
+    assert ended.code == 0
+    drawn = (tmp_path / "fleet.svg").read_text()
+    for text in ("from above", "distance of each pair", "conflict maps"):
+        assert text in drawn
+    assert "--force" in cfplan(*words).err
+
+
 @pytest.mark.parametrize(
     ("lines", "what"),
     [
@@ -99,7 +109,7 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
 @pytest.mark.parametrize(
     ("command", "words", "what"),
     [
-        ("plan", ["-o", "a.parquet"], "plan files and figures are not supported"),
+        ("plan", ["-o", "a.parquet"], "plan files are not supported"),
         ("fly", ["--records", ".", "--on-board"], "do not fly with --on-board"),
         ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7", "--mocap", "vicon://10.0.0.1/a"], "--uri"),
         ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),

@@ -11,6 +11,7 @@ import pytest
 from stepped_flight import fly_stepped
 
 from cfplan.identification.airframe_yaml import write_airframe
+from cfplan.recording.header import FLOWN
 from cfplan.recording.reader import read_record
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -134,6 +135,20 @@ def test_with_the_shipped_airframe_first_flights_are_near_and_second_ones_nearer
     figures, _ = fly_three_times(cfplan, tmp_path, REPOSITORY / "flights" / f"{path}.yaml")
     require_improvement(figures, 0.02, 0.7)
     assert figures[0]["max_deviation"] < 0.05
+
+
+@pytest.mark.slow
+def test_a_flight_on_board_is_corrected_by_the_one_before(patched, cfplan, tmp_path, without_moment):
+    words = REPOSITORY / "flights" / "line.yaml", "--on-board", "--safety", without_moment
+    first, before = fly(cfplan, tmp_path, *words)
+    second, after = fly(cfplan, tmp_path, *words, "--after", first)
+    assert read_record(second).header.provenance[FLOWN] == "on board"
+    assert after["rms_deviation"] < 0.7 * before["rms_deviation"]
+    assert after["travel_time_flown"] is not None
+    assert (second / "uncorrected.parquet").is_file()
+    streamed = cfplan("fly", *words[:1], *words[2:], "--after", first)
+    assert streamed.code == 2
+    assert "add --on-board" in streamed.err
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ def test_hundreds_of_samples_keep_their_shape(load):
         ("shape:\nwaypoints: [[0,0,1],[1,0,1]]\n", ":1:7: shape should be 'fastest' or 'min-snap'"),
         (
             "curve: one.csv\nshape: fastest\n",
-            ":2:1: shape is for waypoints and points only: `curve` is flown as it is given (hint: leave shape out",
+            ":2:1: shape is for waypoints and points only: `curve` already defines its shape (hint: leave shape out",
         ),
         ("polynomials: one.csv\nshape: min-snap\n", ":2:1: shape is for waypoints and points only: `polynomials`"),
         ("samples: one.csv\nshape: fastest\n", ":2:1: shape is for waypoints and points only: `samples`"),

@@ -17,7 +17,17 @@ from cfplan.recording.path_distance import BLOCK, distance_to_path
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import Record
 from cfplan.recording.rerun.states import supervisor_states
-from cfplan.recording.summary import SETTLED, deviation, dropouts, pose_gaps, settling, shares, summarise, summary_text
+from cfplan.recording.summary import (
+    SETTLED,
+    deviation,
+    dropouts,
+    finished,
+    pose_gaps,
+    settling,
+    shares,
+    summarise,
+    summary_text,
+)
 from cfplan.recording.writer import RecordWriter
 from cfplan.vehicle.airframes import AIRFRAMES
 from cfplan.vehicle.correction import PlanCorrection, corrected
@@ -164,6 +174,12 @@ def test_a_path_that_was_not_finished_has_no_travel_time(flight):
     summary = summarise(straight_flight(flight.header, sent_until=BEGIN + TRAVEL / 2))
     assert math.isnan(summary.travel_time_flown)
     assert summary.max_deviation == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_stream_that_ends_where_packets_show_a_hover_flew_the_whole_plan(flight):
+    """As on board: the last moment of a plan is slower than a packet can say."""
+    assert finished(straight_flight(flight.header, sent_until=BEGIN + TRAVEL - 0.05))
+    assert not finished(straight_flight(flight.header, sent_until=BEGIN + TRAVEL - 0.2))
 
 
 def test_a_setpoint_sent_late_with_the_state_of_its_own_time_is_no_deviation(flight):

@@ -280,7 +280,7 @@ def test_a_socket_on_which_another_flight_listens_is_refused_and_stays(place):
 @pytest.mark.parametrize("make", [Path.touch, Path.mkdir, lambda path: path.symlink_to("nowhere")])
 def test_what_is_no_socket_is_refused_and_stays(place, make):
     make(Path("steer.sock"))
-    with pytest.raises(InputError, match="no socket"), opened_lines(place, print):
+    with pytest.raises(InputError, match="not a socket"), opened_lines(place, print):
         pass
     assert os.path.lexists("steer.sock")
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from cfplan.files.atomic import check_new_file, write_atomically
 from cfplan.flight.telemetry import Level
+from cfplan.recording.fleet_record import FleetRecord
 from cfplan.recording.overlay import Trial, short_name, trial_of_record
 from cfplan.recording.plots import FLOWN, Colour, finite_limits, plots
 from cfplan.recording.record import Record
@@ -37,12 +38,15 @@ figcaption i { display: inline-block; width: 14px; margin-right: .4em; vertical-
 """
 
 
-def page(flights: Sequence[ReportedFlight]) -> str:
-    """Return the HTML of the page; several flights are compared first."""
+def page(flights: Sequence[ReportedFlight], fleet: FleetRecord | None = None) -> str:
+    """Return the HTML of the page; several flights are compared first, or shown together if they are of a fleet."""
     title = flights[0].record.header.name if len(flights) == 1 else f"{len(flights)} flights"
+    title = title if fleet is None else fleet.name
     parts = [f"<h1>{html.escape(title)}</h1>", _summary(flights)]
-    if len(flights) > 1:
-        parts.append(_comparison(flights))
+    if fleet is not None:
+        parts.append(_together(fleet))
+    elif len(flights) > 1:
+        parts.append(_comparison([trial_of_record(flight.record, flight.name) for flight in flights]))
     parts += [_flight(flight) for flight in flights]
     versions = sorted({flight.record.header.version for flight in flights})
     return html_page(f"{title}: flight report", "".join(parts), ", ".join(versions))
@@ -59,10 +63,12 @@ def html_page(title: str, body: str, version: str) -> str:
     )
 
 
-def write_page(flights: Sequence[ReportedFlight], file: Path, *, overwrite: bool = False) -> None:
+def write_page(
+    flights: Sequence[ReportedFlight], file: Path, *, fleet: FleetRecord | None = None, overwrite: bool = False
+) -> None:
     """Write the page atomically. Raises InputError if the file cannot be written."""
     check_new_file(file, overwrite=overwrite)
-    write_atomically(file, page(flights).encode())
+    write_atomically(file, page(flights, fleet).encode())
 
 
 def _summary(flights: Sequence[ReportedFlight]) -> str:
@@ -92,8 +98,28 @@ def html_table(
     return f'<div class="scroll"><table class="{kind}">{"".join(lines)}</table></div>'
 
 
-def _comparison(flights: Sequence[ReportedFlight]) -> str:
-    trials = [trial_of_record(flight.record, flight.name) for flight in flights]
+def _together(fleet: FleetRecord) -> str:
+    """Return how near the vehicles of a fleet came, as a table and over time, and where they flew."""
+    pairs, notes = fleet.pairs(), "".join(f'<p class="note">{html.escape(note)}</p>' for note in fleet.notes)
+    heads = ("pair", "nearest", "planned, at least", "at", "where, m")
+    curves = [
+        Curve(" – ".join(pair.pair), pair.time, pair.distance, COLOURS[index % len(COLOURS)])
+        for index, pair in enumerate(pairs)
+    ]
+    charts = [*_views(fleet.trials), time_chart("Distance of columns, m", curves, limits=[fleet.apart])]
+    deviations = [
+        Curve(trial.name, trial.time, trial.deviation, COLOURS[index % len(COLOURS)])
+        for index, trial in enumerate(fleet.trials)
+    ]
+    charts.append(time_chart("Deviation in time, m", deviations))
+    return (
+        f"<h2>Together</h2>{notes}{html_table('numbers', fleet.pair_rows(), heads=heads)}"
+        "<p>Distances are horizontal, by the poses; time counts from the start of the first vehicle's path.</p>"
+        f'<div class="charts">{"".join(charts)}</div>'
+    )
+
+
+def _comparison(trials: Sequence[Trial]) -> str:
     over = [_along(trial) for trial in trials]
     charts = _views(trials)
     for title, values in (

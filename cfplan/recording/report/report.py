@@ -18,7 +18,7 @@ from cfplan.safety.certificate import Certificate
 class ReportedFlight:
     """One record with everything derived from it."""
 
-    name: str  # of its folder
+    name: str  # of its folder, or of a fleet's vehicle
     record: Record
     summary: FlightSummary
     shares: Mapping[str, float]  # usage of the plan's limit by each peak; NaN without such a limit
@@ -30,6 +30,11 @@ class ReportedFlight:
 def read_flight(place: Path) -> ReportedFlight:
     """Read a record, with the plan beside it. Raises InputError if it is not a record."""
     record = read_record(place)
+    return reported(record, record.folder.resolve().name)
+
+
+def reported(record: Record, name: str) -> ReportedFlight:
+    """Return a record with everything derived from it and from the plan beside it."""
     summary = summarise(record)
     notes = ["The record ends early: data after its last complete chunk is lost."] if record.truncated else []
     certificate, plan_rows = None, []
@@ -51,7 +56,7 @@ def read_flight(place: Path) -> ReportedFlight:
     else:
         notes.append("No plan lies beside it, so there is no certificate.")
     return ReportedFlight(
-        name=record.folder.resolve().name,
+        name=name,
         record=record,
         summary=summary,
         shares=shares(summary, record.header.plan_limits),

@@ -52,7 +52,7 @@ def blueprint(
     below = rrb.Horizontal(
         rrb.StateTimelineView(contents=[PHASES, ACTIVE_LIMIT, SUPERVISOR], name=_STATES),
         rrb.Tabs(
-            rrb.TextLogView(origin=EVENTS, name="Events", columns=_event_columns()),
+            rrb.TextLogView(origin=EVENTS, name="Events", columns=event_columns()),
             rrb.TextDocumentView(origin=SUMMARY, name="Summary"),
         ),
         column_shares=[3, 2],
@@ -66,7 +66,8 @@ def blueprint(
     )
 
 
-def _event_columns() -> rrb.TextLogColumns:
+def event_columns() -> rrb.TextLogColumns:
+    """Return the columns of a list of events: level and text, which begins with the time."""
     return rrb.TextLogColumns(
         timeline_columns=[TimelineColumn(TIMELINE, visible=False)],
         text_log_columns=[TextLogColumn("LogLevel"), TextLogColumn("Body")],

@@ -1,6 +1,6 @@
 """Draw several flights in one rerun recording: each trial in its colour, the references dashed."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -63,12 +63,23 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
     names = {"speed": "Speed, m/s", **{axis: f"{axis}, m" for axis in _AXES}}
     if references(trials):
         names = {"deviation": "Deviation, m", **names}
+    return window(
+        rrb.Horizontal(room(trials, "Trials"), rrb.Vertical(*time_plots(trials, names)), column_shares=[6, 5])
+    )
+
+
+def time_plots(trials: Sequence[Trial], names: Mapping[str, str]) -> list[rrb.TimeSeriesView]:
+    """Return axes over the time of all trials, by the names of their plots with a title each."""
     seen = [trial.time[np.isfinite(trial.position).all(axis=1)] for trial in trials]
     moments = np.concatenate([*seen, np.zeros(1)])
     span = (float(moments.min()), float(moments.max()))
-    plots = [time_plot(name, title, span) for name, title in names.items()]
+    return [time_plot(name, title, span) for name, title in names.items()]
+
+
+def window(views: rrb.Container) -> rrb.Blueprint:
+    """Return the layout of these views, with nothing else in the window than the time."""
     return rrb.Blueprint(
-        rrb.Horizontal(_room(trials), rrb.Vertical(*plots), column_shares=[6, 5]),
+        views,
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),
@@ -76,7 +87,8 @@ def blueprint(trials: Sequence[Trial]) -> rrb.Blueprint:
     )
 
 
-def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
+def room(trials: Sequence[Trial], name: str) -> rrb.Spatial3DView:
+    """Return the 3-D view, with all that the trials pass in sight."""
     low, high = extent(trials)
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
     aside = _CAMERA_DISTANCE_FACTOR * np.array(
@@ -84,7 +96,7 @@ def _room(trials: Sequence[Trial]) -> rrb.Spatial3DView:
     )
     return rrb.Spatial3DView(
         origin=WORLD,
-        name="Trials",
+        name=name,
         overrides={f"{_TRIAL}/{i}/tail": [tail_range()] for i in range(len(trials))},
         line_grid=False,
         eye_controls=rrb.EyeControls3D(position=centre + size * aside, look_target=centre, eye_up=(0.0, 0.0, 1.0)),
@@ -125,7 +137,7 @@ def log_trials(stream: rr.RecordingStream, trials: Sequence[Trial]) -> None:
         stream.log(f"{_REFERENCE}/{index}", dashed, static=True)
         for axis, values in zip(_AXES, reference.position.T, strict=True):
             entity = f"{PLOTS}/{axis}/reference_{index}"
-            _log_curve(stream, entity, f"{reference.name} (plan)", PATH_COLOUR, reference.time, values)
+            log_curve(stream, entity, f"{reference.name} (plan)", PATH_COLOUR, reference.time, values)
     for index, trial in enumerate(trials):
         colour = COLOURS[index % len(COLOURS)]
         _log_track(stream, f"{_TRIAL}/{index}", trial, colour)
@@ -133,7 +145,7 @@ def log_trials(stream: rr.RecordingStream, trials: Sequence[Trial]) -> None:
         if trial.reference is not None:
             curves["deviation"] = trial.deviation
         for name, values in curves.items():
-            _log_curve(stream, f"{PLOTS}/{name}/trial_{index}", short_name(trial.name), colour, trial.time, values)
+            log_curve(stream, f"{PLOTS}/{name}/trial_{index}", short_name(trial.name), colour, trial.time, values)
 
 
 def dashes(points: NDArray) -> list[NDArray]:
@@ -185,9 +197,10 @@ def _drawn(trial: Trial) -> NDArray:
     return seen[:: max(1, round(1 / max(DRAWN_RATE * step, 1e-3)))]
 
 
-def _log_curve(
+def log_curve(
     stream: rr.RecordingStream, entity: str, label: str, colour: Colour, time: NDArray, values: NDArray
 ) -> None:
+    """Send values over time, (N,), as a curve with its label; NaN breaks it."""
     style = rr.SeriesLines(colors=[colour], names=[label], widths=[1.5], aggregation_policy="MinMax")
     stream.log(entity, style, static=True)
     known = np.isfinite(values)

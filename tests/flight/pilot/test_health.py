@@ -106,7 +106,7 @@ def test_an_armed_vehicle_whose_status_fell_silent_is_disarmed_by_more_than_one_
     fly()
     assert world.calls.count("disarm") > 1
     assert not world.armed
-    assert "does not say that it is disarmed" in world.said
+    assert "does not confirm that it is disarmed" in world.said
 
 
 def test_a_silent_vehicle_that_acknowledges_flies_its_certified_stop(world, fly, mission):

@@ -31,10 +31,10 @@ BAD = {
     "radio://0/80/2M/E7E7": "not an address",
     "radio://0/80/2M/E7E7E7E7EX": "not an address",
     "radio://0/80/2M/E7E7E7E7E7/more": "not the URI of a radio",
-    "udp://127.0.0.1": "its port",
-    "udp://:19850": "its port",
-    "udp://127.0.0.1:70000": "its port",
-    "usb://": "number of the vehicle",
+    "udp://127.0.0.1": "host and port",
+    "udp://:19850": "host and port",
+    "udp://127.0.0.1:70000": "host and port",
+    "usb://": "number of the USB device",
     "sim://nonsense": "no such virtual vehicle",
 }
 
