@@ -2,6 +2,7 @@
 
 __all__ = [
     "export_flight",
+    "fleet_figure",
     "from_programs",
     "link_loss_assessment",
     "on_board_flight",

@@ -1,3 +1,3 @@
 """Flights, plans and logs shown in rerun."""
 
-__all__ = ["live", "overlay_view", "record_view", "viewer"]
+__all__ = ["fleet_view", "live", "overlay_view", "record_view", "viewer"]
