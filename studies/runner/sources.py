@@ -1,7 +1,7 @@
 """The sources that a study's figures depend on, and their digest: a result of other sources is out of date.
 
 The sources are the study's module, all modules of cfplan and studies that it imports, directly or not, and the shipped
-models and limits. Comments, docstrings and layout do not count.
+models and limits. Comments, docstrings, layout and lists of what a room offers do not count.
 """
 
 import ast
@@ -69,10 +69,13 @@ def _code_digest(file: Path) -> str:
     tree = copy.deepcopy(_tree(file))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
-        if isinstance(body, list):  # a string as a statement is documentation
-            node.body = [each for each in body if not _is_text(each)]  # type: ignore[attr-defined]
+        if isinstance(body, list):
+            node.body = [each for each in body if not _is_documentation(each)]  # type: ignore[attr-defined]
     return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
-def _is_text(node: ast.AST) -> bool:
+def _is_documentation(node: ast.AST) -> bool:
+    """Return whether a statement is a string, or the list `__all__`."""
+    if isinstance(node, ast.Assign):
+        return [ast.unparse(target) for target in node.targets] == ["__all__"]
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)

@@ -39,6 +39,7 @@ def copy(tmp_path_factory):
         ("safety.yaml", "", "\n# a word\n", True),
         ("cfplan/simulation/dry_run.py", "", "\n# a word\n", False),
         ("studies/dry_runs.py", '"""Fly', '"""Do fly', False),
+        ("cfplan/simulation/__init__.py", "__all__ = [", '__all__ = ["another", ', False),
         ("studies/steering.py", "", "\n_UNUSED = 1\n", False),  # another study
     ],
 )
