@@ -18,6 +18,7 @@ MENTIONED = ("init --mass", "fly --on-board", "doctor --uri", "dataset make --pl
 AS_SHOWN = "tests/cli/test_commands_of_the_pages.py::test_a_command_ends_well_as_it_is_shown"
 FLOWN = "tests/cli/test_commands_of_the_pages.py::test_a_flight_lands_as_it_is_shown"
 AGAIN = "tests/cli/test_fly_again.py::test_a_second_flight_goes_as_it_is_shown"
+FLEETS = "tests/integration/test_fleet_in_real_time.py::test_a_fleet_lands_as_it_is_shown"
 STEERED = "tests/cli/test_commands_of_the_pages.py::test_waypoints_are_flown_as_it_is_shown"
 COMPLETED = "tests/cli/test_commands_of_the_pages.py::test_completion_is_set_up_as_it_is_shown"
 ROOM = "tests/cli/test_virtual_in_real_time.py::test_a_second_terminal_flies_one_of_two_vehicles_by_its_own_poses"
@@ -31,6 +32,7 @@ RUN_BY = (
     (r"cfplan (virtual|mocap)\b|--uri udp:|cfplan doctor --uri", ROOM),
     (r"python -m cfplan fly …$", AS_SHOWN),
     (r"cfplan fly --waypoints", STEERED),
+    (r"cfplan fly flights/fleets/", FLEETS),
     (r"cfplan fly .*--after", AGAIN),
     (r"cfplan fly", FLOWN),
     (r"cfplan (dataset|train|bench|robustness)|python -m studies", MEASURED),

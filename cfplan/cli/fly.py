@@ -113,13 +113,12 @@ def fly(
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        prepare = _preparation(on_board, after, planning, uri)
-        prepared = prepare(path_or_plan, limits, options.flight_options(planning, safety_file, path_or_plan), steps)
+        flight_options = options.flight_options(planning, safety_file, path_or_plan)
+        prepared = _preparation(on_board, after, planning, uri)(path_or_plan, limits, flight_options, steps)
         if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
             return int(ExitCode.ENDED_BY_OPERATOR)
         flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
-    _print_result(prepared, flown, as_json)
-    return int(flown.outcome.exit_code)
+    return _print_result(prepared, flown, as_json)
 
 
 def _fly_fleet(
@@ -203,7 +202,8 @@ def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board:
     return lines
 
 
-def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) -> None:
+def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) -> int:
+    """Print how a flight went, and return its exit code."""
     outcome, summary, folder = flown.outcome, flown.summary, str(flown.record.folder)
     if as_json:
         document = {"record": folder, "plan": prepared.planned.to_dict(), **summary}
@@ -225,6 +225,7 @@ def _print_result(prepared: "Prepared", flown: "RecordedFlight", as_json: bool) 
         click.echo(f"{styled('ended:', 'yellow')} {reason}", err=True)
     elif outcome.exit_code is not ExitCode.OK:
         click.echo(f"{styled('error:', 'red')} {reason}", err=True)
+    return int(outcome.exit_code)
 
 
 def _expected(prepared: "Prepared") -> dict[str, float]:

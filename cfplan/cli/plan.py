@@ -42,11 +42,9 @@ def plan(
     how near each pair comes.
     """
     steps = Steps(as_json=as_json)
-    is_fleet = fleet.is_fleet(path_file)
-    if is_fleet:
-        fleet.refuse_output(output)
     _check_files(output, figure, force)
-    if is_fleet:
+    if fleet.is_fleet(path_file):
+        fleet.refuse_output(output)
         return fleet.plan_and_print(path_file, safety_file, planning, figure, force, steps)
     limits = options.read_limits(safety_file, path_file, steps)
     with steps.waiting("loading planners"):

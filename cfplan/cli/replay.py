@@ -83,13 +83,11 @@ def replay(
     from cfplan.recording.fleet_record import is_fleet_record
     from cfplan.recording.reader import is_record
 
-    one_fleet = len(flights) == 1 and plan_file is None and is_fleet_record(flights[0])
+    one = len(flights) == 1 and plan_file is None
+    one_fleet, one_record = one and is_fleet_record(flights[0]), one and is_record(flights[0])
     if not one_fleet and len(flights) == 1 and (records := flights_in(flights[0])):
-        print_flights(records, as_json=as_json)
-        return
-    steps = Steps(as_json=as_json)
-    files = Files(save, png, figure, gif, moment, force)
-    one_record = len(flights) == 1 and plan_file is None and is_record(flights[0])
+        return print_flights(records, as_json=as_json)
+    steps, files = Steps(as_json=as_json), Files(save, png, figure, gif, moment, force)
     files.check(one_record=one_record)
     if one_fleet:
         document = _replay_fleet(flights[0], files, steps)

@@ -1,12 +1,17 @@
 """Fleets in real time: a pilot's process for each virtual vehicle, the conductor in the main process."""
 
+import json
 import os
+import shlex
 import signal
+import subprocess
+import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pages
 import pytest
 from septic_flight import septic_payloads
 
@@ -26,7 +31,8 @@ from cfplan.steering.fleet_room import FleetRoom, VehiclePlace
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
 
-SHIPPED = load_limits(Path(__file__).parents[2] / "safety.yaml")
+REPOSITORY = Path(__file__).parents[2]
+SHIPPED = load_limits(REPOSITORY / "safety.yaml")
 LIMITS = replace(  # the computer that runs tests stands still now and then
     SHIPPED, pose=replace(SHIPPED.pose, age_brake=0.5, age_land=1.5), lateness=0.1
 )
@@ -95,3 +101,13 @@ def test_the_other_brakes_when_the_process_of_a_pilot_is_killed():
     assert outcome.exit_code is ExitCode.LINK_LOST
     assert truths["right"].position[:, 0].max() < 0.5
     assert_down(truths)
+
+
+@pytest.mark.parametrize("line", pages.lines_for(pages.FLEETS))
+def test_a_fleet_lands_as_it_is_shown(tmp_path, line):
+    command = [sys.executable, "-m", *shlex.split(line), "--records", tmp_path, "--json"]
+    ended = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    (flight,) = tmp_path.iterdir()
+    vehicles = json.loads(ended.stdout)["vehicles"]
+    assert len(vehicles) == len([each for each in flight.iterdir() if each.is_dir()]) == 2

@@ -175,7 +175,7 @@ def test_an_interrupted_run_goes_on_where_it_stopped(made, tmp_path, monkeypatch
 
 
 def test_a_full_disk_loses_nothing_that_was_written(made, tmp_path, monkeypatch):
-    write = dataset.whole
+    write = dataset.atomic_write
     written: list[Path] = []
 
     def write_until_full(file):
@@ -184,7 +184,7 @@ def test_a_full_disk_loses_nothing_that_was_written(made, tmp_path, monkeypatch)
         written.append(file)
         return write(file)
 
-    monkeypatch.setattr(dataset, "whole", write_until_full)
+    monkeypatch.setattr(dataset, "atomic_write", write_until_full)
     with pytest.raises(InputError, match="No space left"):
         make_dataset(tmp_path, SMALL)
     monkeypatch.undo()

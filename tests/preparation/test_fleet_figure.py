@@ -29,7 +29,7 @@ def lines(limits):
 
 def fleet_of(plans, limits, delay):
     members = (FleetMember("a$x$", plans[0]), FleetMember("_b", plans[1], delay))
-    return PlannedFleet("cross", APART, SKEW, members, separations(members, SKEW), members[0].end, limits)
+    return PlannedFleet("cross", APART, SKEW, members, separations(members, SKEW), (), members[0].end, limits)
 
 
 def axes_of(figure, title):

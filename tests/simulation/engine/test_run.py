@@ -18,7 +18,7 @@ from cfplan.simulation.engine.layout import (
     new_vehicle,
     pack_airframe,
 )
-from cfplan.simulation.engine.mellinger import FULL_STATE, LEVEL_OUT, ask, mixed, step_mellinger
+from cfplan.simulation.engine.mellinger import FULL_STATE, LEVEL_OUT, mixed, step_mellinger, store_commands
 from cfplan.simulation.engine.run import NEVER, PART, Schedule, Vehicles, simulate
 
 STEP = 4  # ms
@@ -71,7 +71,7 @@ def alone(snapshot, setpoint, gains, airframe):
             vehicle[SETPOINT + 15], mode = 0.0, LEVEL_OUT
         if step < STOPS:
             control = step_mellinger(vehicle, gains, mode, vehicle[:13], 0.001 * STEP)
-            ask(vehicle, 1, 0, mixed(control))
+            store_commands(vehicle, 1, 0, mixed(control))
         else:
             vehicle[ASKED : ASKED + 4] = 0.0
         step_body(vehicle, 0.001 * STEP)
