@@ -31,6 +31,11 @@ def copy(tmp_path_factory):
     return folder
 
 
+@pytest.fixture(scope="module")
+def unchanged(copy):
+    return digest_of_copy(copy)
+
+
 @pytest.mark.parametrize(
     ("file", "old", "new", "changes"),
     [
@@ -43,11 +48,11 @@ def copy(tmp_path_factory):
         ("studies/steering.py", "", "\n_UNUSED = 1\n", False),  # another study
     ],
 )
-def test_the_digest_changes_with_the_code_that_a_study_imports_alone(copy, file, old, new, changes):
-    before, text = digest_of_copy(copy), (copy / file).read_text()
+def test_the_digest_changes_with_the_code_that_a_study_imports_alone(copy, unchanged, file, old, new, changes):
+    text = (copy / file).read_text()
     (copy / file).write_text(text.replace(old, new, 1) if old else text + new)
     try:
-        assert (digest_of_copy(copy) != before) == changes
+        assert (digest_of_copy(copy) != unchanged) == changes
     finally:
         (copy / file).write_text(text)
 
