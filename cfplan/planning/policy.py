@@ -89,7 +89,7 @@ class Step(NamedTuple):
     finishes: bool = False  # whether grids are tried until a profile needs no slowing at all
 
 
-# Convex and min-snap hardly ever fail, so every policy ends with one of them. The fastest result is used.
+# Convex and min-snap rarely fail, so every policy ends with one of them. The fastest result is used.
 # PLANNERS defines whether a planner's profile is refined or only slowed if it does not pass.
 POLICIES = MappingProxyType(
     {

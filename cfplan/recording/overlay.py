@@ -132,7 +132,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
     before and after matters. Parts of the plan that were not seen count with the plan's own variance. A constant delay
     of the vehicle is compensated too: a log alone cannot distinguish the two.
 
-    Raises InputError if the subject was hardly seen.
+    Raises InputError if the subject has too few poses.
     """
     time, position = subject.time[subject.seen], subject.position[subject.seen]
     if len(time) < 2 or time[-1] - time[0] < 2 * STEP:

@@ -17,7 +17,7 @@ from cfplan.recording.rerun.fleet_view import write_fleet
 from cfplan.recording.writer import RecordWriter
 
 ASIDE = np.array([1.0, 0.0, 0.3])  # m, of the second vehicle from the first
-LATER = 1.5  # s, by which it begins
+LATER = 1.5  # s, delay of the second vehicle's start
 APART = 0.3  # m
 TRAVEL = 10.0  # s, of the made-up flight along its path
 

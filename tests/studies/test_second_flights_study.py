@@ -1,4 +1,4 @@
-"""The study of second flights, on made-up flights of which it is known what repeats, and on the public ones."""
+"""The study of second flights: on synthetic flights with a known repeated deviation, and on the public ones."""
 
 import json
 from pathlib import Path

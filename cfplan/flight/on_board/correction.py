@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-_LEAD = 0.1  # s by which the shift leads the deviation, about the vehicle's delay in following it
+_LEAD = 0.1  # s, lead of the shift over the deviation: about the delay with which the vehicle follows it
 _SPACING = 0.25  # s between knots
 _DEGREE = 7  # for four smooth derivatives
 _REST = 5  # zero coefficients at each end, for a zero shift with four derivatives

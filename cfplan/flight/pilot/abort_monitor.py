@@ -21,7 +21,7 @@ from cfplan.safety.space import inside
 
 LATEST_SETPOINT = 0.25  # s, latest setpoint; the vehicle stops following after 0.5 s
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit on the distance between estimate and pose, in the air
-FALLEN = 0.15  # m below its setpoint, from which a vehicle on the floor counts as fallen
+FALLEN = 0.15  # m; a vehicle on the floor that is farther below its setpoint has fallen
 
 
 @dataclass(slots=True)

@@ -66,7 +66,7 @@ class FlightOutcome:
     exit_code: ExitCode
     reason: str  # one line
     rung: Rung  # how far down the abort ladder it went
-    checks: tuple[Check, ...]  # the preflight table, as far as it was run
+    checks: tuple[Check, ...]  # the checks of preflight up to the last one that was made
     phases: tuple[tuple[Phase, float], ...]  # each phase entered, with its time on the clock of time.monotonic()
     first_setpoint: float  # s on the same clock; 0 if none was sent
     flown: float  # s, from the first setpoint to the last that moved
