@@ -179,8 +179,8 @@ def test_swapped_bodies_are_refused_before_anything_is_armed(tmp_path):
     with FleetRoom(places, LIMITS) as room:
         mocap = room.lab.mocap_uri.rpartition("/")[0]
         file = narrow_room(tmp_path, *(f"udp://127.0.0.1:{port}" for port in room.lab.ports))
-        with connect_fleet(file, mocap=mocap, safety=LIMITS, records=None) as fleet:
-            with pytest.raises(FlightEndedError, match="swapped"):
-                fleet.take_off()
+        fleet = connect_fleet(file, mocap=mocap, safety=LIMITS, records=None)
+        with fleet, pytest.raises(FlightEndedError, match="swapped"):
+            fleet.take_off()
         truths = [room.lab.truth(number) for number in range(2)]
     assert all(not truth.motor.any() for truth in truths)
