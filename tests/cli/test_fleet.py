@@ -79,38 +79,6 @@ def test_the_figure_of_a_fleet_has_its_paths_distances_and_conflict_map(cfplan, 
     assert "--force" in cfplan(*words).err
 
 
-RADIO = "uri: 'radio://{}/80/2M/E7E7E7E7{}'"
-
-
-@pytest.mark.parametrize(
-    ("a", "b", "words", "what"),
-    [
-        ("uri: 'sim://1'", "", [], "a and b have the same address"),
-        ("body: b", "", [], "a and b have the same body"),
-        (RADIO.format(0, "01"), "", [], "b is a virtual vehicle, and a is not"),
-        (RADIO.format(0, "01"), RADIO.format(1, "02"), [], "need a source of poses"),
-        (RADIO.format(0, "01"), RADIO.format(0, "02"), ["--mocap", "vicon://10.0.0.1"], "a and b share dongle 0"),
-        (RADIO.format(0, "0a"), RADIO.format(1, "0A"), ["--mocap", "vicon://10.0.0.1"], "have the same address"),
-        ("uri: 'radio://0/80/2M/1'", RADIO.format(1, "01"), ["--mocap", "vicon://10.0.0.1"], "not an address"),
-        ("uri: 'radio://0/200'", RADIO.format(1, "01"), ["--mocap", "vicon://10.0.0.1"], "not a channel"),
-        ("uri: 'here'", RADIO.format(1, "01"), ["--mocap", "vicon://10.0.0.1"], "not the URI of a vehicle"),
-        (RADIO.format(0, "01"), RADIO.format(1, "02"), ["--mocap", "vicon://10.0.0.1/a"], "cannot be that of every"),
-        (RADIO.format(0, "01"), RADIO.format(1, "02"), ["--mocap", "video://10.0.0.1"], "unknown motion capture"),
-        ("", "", ["--mocap", "vicon://10.0.0.1"], "have a virtual Vicon"),
-    ],
-)
-def test_a_fleet_whose_addresses_or_bodies_are_wrong_does_not_fly(
-    cfplan, fleet_file, safety_file, tmp_path, a, b, words, what
-):
-    text = fleet_file.read_text().replace("a: {path: line.yaml", f"a: {{path: line.yaml, {a}")
-    fleet_file.write_text(text.replace("b: {path: line.yaml", f"b: {{path: line.yaml, {b}").replace(", }", "}"))
-    ended = cfplan("fly", fleet_file, "--safety", safety_file(), "--records", tmp_path / "records", *words)
-    assert ended.code == 2
-    assert what in " ".join(ended.err.split())
-    assert "hint" in ended.err
-    assert not (tmp_path / "records").exists()
-
-
 def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     ended = cfplan("check", fleet_file, "--safety", safety_file())
     assert ended.code == 0
