@@ -1,4 +1,4 @@
-"""Fly every PATH on the virtual Crazyflie in real time, one flight after another, each with a different noise seed.
+"""Fly every PATH on the virtual Crazyflie, in real time or stepped, each flight with a different noise seed.
 
 Measures the deviation from the plan, by the poses and by the simulated truth, and how late setpoints are sent.
 """
@@ -13,17 +13,25 @@ import numpy as np
 
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.pilot.mission import Mission, mission_of
+from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight, encode_motion, motion_at
 from cfplan.flight.setpoints.level_out import BRAKE_LEAD
 from cfplan.flight.setpoints.packets import decode
+from cfplan.flight.telemetry import Phase, PhaseEntered, SetpointSent, Telemetry
 from cfplan.geometry.path_file import load_path_file
 from cfplan.preparation.plan_flight import plan_flight
 from cfplan.preparation.prepare_flight import encode_flight, rehearse
 from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.dry_run import dry_run
+from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import hopf_quaternion
 from cfplan.vehicle.trajectory import Trajectory
+from studies.fault_scenarios import Scenario
+from studies.faults import fly_stepped
 from studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
@@ -66,6 +74,8 @@ FLIGHT_COLUMNS = (
         value=mean("true_deviation_max"),
     ),
     Column("true_max", "true, max", "cm", ".1f", value=largest("true_deviation_max")),
+    Column("within", "within the dry run's 95 %", of="landed", value=count("within"),
+           meaning="flights whose largest true deviation the dry run's 95th percentile covers"),
     Column(
         "off_plan", "time off plan", "%", ".2f", value=largest("off_plan"),
         meaning="first setpoint to last, against the plan; the worst",
@@ -94,6 +104,7 @@ class Settings:
     pose_noise: float = option(0.001, "Standard deviation of poses on each axis, m.", least=0)
     drawn: bool = option(False, "Each flight on another vehicle, drawn by the spread of the airframe.")
     seed: int = option(0, "Seed of the noise of each path's first flight.", least=0)
+    stepped: bool = option(False, "Fly on a clock that runs only while the pilot sleeps, whatever the computer's load.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +139,11 @@ class JudgedFlight:
         return self.planned / self.lower_bound - 1
 
     @property
+    def within(self) -> bool:
+        """Return whether the dry run's 95th percentile covers the largest true deviation."""
+        return self.true_deviation_max <= self.dry_run
+
+    @property
     def off_plan(self) -> float:
         """Return the relative difference between streamed and planned time."""
         return abs(self.streamed / self.planned - 1)
@@ -141,11 +157,12 @@ class Prepared(NamedTuple):
     trajectory: Trajectory | None = None
 
 
-def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] = fly_in_real_time) -> Work:
+def work(settings: Settings, run: Run, *, fly: Callable[..., RealTimeFlight] | None = None) -> Work:
     """Return one case per flight: each path `repeats` times, each with its own seed. A failure is a row.
 
     Raises InputError, before anything is planned, if a file is not a path file or a condition is out of range.
     """
+    fly = fly or (fly_on_stepped_clock if settings.stepped else fly_in_real_time)
     lab = Conditions(settings.loss, settings.pose_noise, settings.seed)
     for file in settings.path_files:
         load_path_file(file)
@@ -229,6 +246,31 @@ def without_drag(encoded: EncodedFlight, trajectory: Trajectory) -> EncodedFligh
     motion = replace(motion_at(trajectory, times), acceleration=states.acceleration, quaternion=quaternion)
     payloads = encode_motion(motion, trajectory.at(times + BRAKE_LEAD).acceleration, encoded.gains, space=encoded.space)
     return replace(encoded, payloads=payloads, decoded=decode(payloads))
+
+
+def fly_on_stepped_clock(mission: Mission, conditions: Conditions, *, name: str) -> RealTimeFlight:
+    """Fly a mission in the stepped lab. Setpoints are never late there."""
+    flight, streaming = RealTimeFlight(None, ""), False
+
+    def hear(message: Telemetry) -> None:
+        nonlocal streaming
+        if isinstance(message, PhaseEntered):
+            streaming = message.phase is Phase.STREAM
+        elif isinstance(message, SetpointSent) and streaming:
+            flight.sent.append(message)
+
+    seed = conditions.seed
+    lab = SteppedLab(
+        conditions.airframe or mission.limits.airframe,
+        vehicle=VehicleSettings(seed=seed),
+        cameras=ViconSettings(position_noise=conditions.pose_noise, seed=seed),
+        seed=seed,
+    )
+    if conditions.loss:
+        lab.disturb(RadioFault(RadioFaultKind.LOSS, size=conditions.loss))
+    flown = fly_stepped(Scenario(name, Rung.NONE), mission, listen=hear, lab=lab)
+    flight.outcome, flight.reason, flight.truth = flown.outcome, flown.reason, flown.truth
+    return flight
 
 
 def _judged(row: JudgedFlight, trajectory: Trajectory, flight: RealTimeFlight) -> JudgedFlight:

@@ -1,13 +1,14 @@
 """Steer the virtual vehicle in real time, and measure how soon requests change the motion, and at what rate.
 
 Pilot, planner and lab are processes. First the vehicle hovers, to measure the lateness of its stream alone. Then
-requests come one at a time, each replacing the path ahead by a tour of 10 m through random waypoints. Then they come
-much faster than they can be planned, and the latest wins.
+requests come one at a time, each replacing the path ahead by a tour of 10 m through random waypoints. In a second
+flight, as no battery lasts for both, they come much faster than they can be planned, and the latest wins.
 """
 
 import os
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -79,7 +80,7 @@ RATE_COLUMNS = (
 class Settings:
     """Number and rate of requests."""
 
-    requests: int = option(100, "Requests one at a time.", least=1)
+    requests: int = option(100, "Requests one at a time; a battery lasts for some 500.", least=1)
     seconds: float = option(60.0, "Duration of the fast requests, and of hovering before, s.", least=1)
     rate: float = option(100.0, "Fast requests per second.", least=0.1)
     seed: int = option(0, "Seed of the waypoints.", least=0)
@@ -144,8 +145,31 @@ class HeardSteering(RealTimeSteering):
         super().start(mission, timeline, Listeners(hear, hear_answer))
 
 
+class Asking:
+    """A flight in which tours are requested; `asked` is when each request was made, by its number."""
+
+    def __init__(self, limits: Limits, chance: np.random.Generator):
+        self.flight, self.asked = HeardSteering(limits), dict[int, float]()
+        self._limits, self._chance = limits, chance
+
+    @contextmanager
+    def flying(self) -> Iterator[SteeredVehicle]:
+        """Take off with a full battery. Raises a CfplanError if the vehicle does not, or its flight ends early."""
+        with SteeredVehicle(self.flight, self._limits, uri="sim://0") as vehicle:
+            vehicle.take_off(_HEIGHT)
+            yield vehicle
+
+    def ask(self, vehicle: SteeredVehicle) -> int:
+        """Request a tour from where the vehicle is going; return the request's number."""
+        tour = list(_tour(self._chance, vehicle.target, self._limits))
+        begun = vehicle.time
+        number = vehicle.request(Wish.REPLACE, tour)
+        self.asked[number] = begun
+        return number
+
+
 def work(settings: Settings, run: Run) -> Work:
-    """Return one case: the flight, under the limits of this folder."""
+    """Return one case: both flights, under the limits of this folder."""
     return Work({"flight": settings}, partial(measure, limits=limits_for(Path())), Stretch)
 
 
@@ -156,38 +180,41 @@ def measure(settings: Settings, limits: Limits) -> list[Stretch]:
         CfplanError: the vehicle did not take off, or its flight ended early.
         InputError: none of the requests that came one at a time was accepted.
     """
-    limits = patient(limits)
-    chance = np.random.default_rng(settings.seed)
-    flight, asked = HeardSteering(limits), dict[int, float]()
+    limits, chance = patient(limits), np.random.default_rng(settings.seed)
+    return [*_calm(settings, limits, chance), _fast(settings, limits, chance)]
 
-    def ask(vehicle: SteeredVehicle) -> int:
-        tour = list(_tour(chance, vehicle.target, limits))
-        begun = vehicle.time
-        number = vehicle.request(Wish.REPLACE, tour)
-        asked[number] = begun
-        return number
 
-    with SteeredVehicle(flight, limits, uri="sim://0") as vehicle:
-        vehicle.take_off(_HEIGHT)
+def _calm(settings: Settings, limits: Limits, chance: np.random.Generator) -> list[Stretch]:
+    """Fly one battery: hover, then ask one request at a time."""
+    asking = Asking(limits, chance)
+    with asking.flying() as vehicle:
         begun = _mark(vehicle)
         vehicle.sleep(settings.seconds)
         hovered = _mark(vehicle)
         for _ in range(settings.requests):
-            vehicle.answer_to(ask(vehicle))
+            vehicle.answer_to(asking.ask(vehicle))
             vehicle.sleep(float(chance.uniform(*_PAUSE)))
-        one_by_one, answered = dict(asked), _mark(vehicle)
-        while (now := vehicle.time) < answered.time + settings.seconds:
-            ask(vehicle)
+        answered = _mark(vehicle)
+        vehicle.land()
+    one_by_one = _stretch(ONE_BY_ONE, asking.flight, asking.asked, hovered, answered)
+    return [  # once all messages have come
+        _stretch("hovering, no requests", asking.flight, (), begun, hovered),
+        replace(one_by_one, replans=find_replans(asking.flight, asking.asked)),
+    ]
+
+
+def _fast(settings: Settings, limits: Limits, chance: np.random.Generator) -> Stretch:
+    """Fly another battery, with requests much faster than plans."""
+    asking = Asking(limits, chance)
+    with asking.flying() as vehicle:
+        begun = _mark(vehicle)
+        while (now := vehicle.time) < begun.time + settings.seconds:
+            asking.ask(vehicle)
             vehicle.sleep(max(now + 1.0 / settings.rate - vehicle.time, 0.0))
         ended = _mark(vehicle)
-        vehicle.answer_to(max(asked))
+        vehicle.answer_to(max(asking.asked))
         vehicle.land()
-    many = asked.keys() - one_by_one.keys()
-    return [  # once all messages have come
-        _stretch("hovering, no requests", flight, (), begun, hovered),
-        replace(_stretch(ONE_BY_ONE, flight, one_by_one, hovered, answered), replans=find_replans(flight, one_by_one)),
-        _stretch(f"{settings.rate:g} requests a second", flight, many, answered, ended),
-    ]
+    return _stretch(f"{settings.rate:g} requests a second", asking.flight, asking.asked, begun, ended)
 
 
 def tables(settings: Settings, rows: list[Stretch]) -> Iterator[Table]:

@@ -154,6 +154,15 @@ def test_without_drag_compensation_a_vehicle_that_is_as_planned_deviates_three_t
     assert deviations[1] > 3 * deviations[0]
 
 
+def test_a_stepped_flight_of_a_drawn_vehicle_lands_within_the_dry_runs_promise():
+    settings = Settings((LINE,), loss=0.05, seed=3, drawn=True, stepped=True)
+    (flight,) = run_study("flights", "studies.flights", STUDY, settings).rows
+    assert flight.landed
+    assert flight.late_max < 1e-6
+    assert 0.005 < flight.true_deviation_max <= flight.dry_run
+    assert flight.within
+
+
 def test_no_flight_at_all_is_a_table_too():
     assert study(outcome(ExitCode.LINK_LOST))[0].table("flights-by-path").cells()[1][-1][1] == "0/1"
 
