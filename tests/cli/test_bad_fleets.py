@@ -2,7 +2,6 @@
 
 import pytest
 
-from cfplan.flight.radio import crazyradio
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.simulation.virtual_vicon.vicon import serve
 
@@ -19,9 +18,8 @@ def radio(dongle, address):
 
 @pytest.fixture
 def fly(cfplan, safety_file, tmp_path, monkeypatch):
-    """Fly two vehicles a metre apart, with these keys each, where one dongle is plugged in; how the command ended."""
-    monkeypatch.setattr(crazyradio, "find_radios", lambda kind=crazyradio.CRAZYRADIO: [object()])
-    monkeypatch.setattr(crazyradio, "_take", lambda radio, uri: None)
+    """Fly two vehicles a metre apart, with these keys each, where no dongle is plugged in; how the command ended."""
+    monkeypatch.setattr("cfplan.flight.radio.crazyradio.find_radios", lambda kind=None: [])
     monkeypatch.setattr("cfplan.steering.connected_fleet.plan_fleet", lambda *_: pytest.fail("it was planned"))
     (tmp_path / "line.yaml").write_text("waypoints: [[-0.6, 0, 1], [0.6, 0, 1]]\n")
 
@@ -61,7 +59,7 @@ def fly(cfplan, safety_file, tmp_path, monkeypatch):
         (radio(0, "01"), radio(1, "02"), ["--mocap", "vicon://10.0.0.1/a"], 2, "cannot be that of every"),
         (radio(0, "01"), radio(1, "02"), ["--mocap", "video://10.0.0.1"], 2, "unknown motion capture"),
         ("", "", MOCAP, 2, "have a virtual Vicon"),
-        (radio(0, "01"), radio(1, "02"), SEEN, 8, "there is no radio 1"),
+        (radio(0, "01"), radio(1, "02"), SEEN, 8, "no Crazyradio is plugged in"),
         ("uri: 'udp://127.0.0.1:19850'", "uri: 'udp://127.0.0.1:19851'", SEEN, 2, "no body named 'b'"),
     ],
 )

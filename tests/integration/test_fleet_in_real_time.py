@@ -132,22 +132,6 @@ def test_a_program_flies_a_fleet_as_the_page_shows(tmp_path, monkeypatch, capsys
     assert "weave" in capsys.readouterr().out
 
 
-def test_a_fleet_of_a_program_lands_where_it_hovers_and_changes_no_path(tmp_path):
-    with connect_fleet(narrow_room(tmp_path), safety=LIMITS, records=None) as fleet:
-        with pytest.raises(InputError, match="take_off"):
-            fleet.fly()
-        fleet.take_off()
-        for change in (fleet.replace, fleet.fly, fleet.extend, fleet.stop, fleet.slower, fleet.ask, fleet.request):
-            with pytest.raises(RequestRefusedError, match="in the air"):
-                change([[0, 0, 1]])
-        assert min(height for _, _, height in fleet.positions.values()) > 0.5
-        fleet.land()
-        assert fleet.outcome.exit_code is ExitCode.ENDED_BY_OPERATOR
-        with pytest.raises(FlightEndedError):
-            fleet.fly()
-    assert fleet.record is None
-
-
 def narrow_room(folder: Path, *uris: str) -> Path:
     """Write a fleet of two lines 1 m apart; return its file."""
     for number, name in enumerate(NAMES):
@@ -166,8 +150,16 @@ def test_a_fleet_with_addresses_flies_by_the_poses_of_a_motion_capture_system(tm
         mocap = room.lab.mocap_uri.rpartition("/")[0]
         file = narrow_room(tmp_path, *(f"udp://127.0.0.1:{port}" for port in room.lab.ports))
         with connect_fleet(file, mocap=mocap, safety=LIMITS, records=None) as fleet:
+            with pytest.raises(InputError, match="take_off"):
+                fleet.fly()
             fleet.take_off()
+            for change in (fleet.replace, fleet.fly, fleet.extend, fleet.stop, fleet.slower, fleet.ask, fleet.request):
+                with pytest.raises(RequestRefusedError, match="in the air"):
+                    change([[0, 0, 1]])
+            assert not fleet.begun
             fleet.finish()
+            with pytest.raises(FlightEndedError):
+                fleet.fly()
         assert fleet.outcome.exit_code is ExitCode.OK, fleet.outcome.ends
         truths = {name: room.lab.truth(number) for number, name in enumerate(NAMES)}
     assert_down(truths)
