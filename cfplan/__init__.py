@@ -21,10 +21,12 @@ if TYPE_CHECKING:
     from cfplan.preparation.plan_flight import PlannedFlight as Plan
     from cfplan.safety.limits_file import load_limits
     from cfplan.steering.connect import connect
+    from cfplan.steering.connected_fleet import ConnectedFleet, connect_fleet
     from cfplan.steering.steered_vehicle import SteeredVehicle
 
 __all__ = [
     "CfplanError",
+    "ConnectedFleet",
     "FlightEndedError",
     "InfeasibleError",
     "InputError",
@@ -39,6 +41,7 @@ __all__ = [
     "Wish",
     "__version__",
     "connect",
+    "connect_fleet",
     "load_limits",
     "load_path",
     "plan",
@@ -46,12 +49,14 @@ __all__ = [
 ]
 
 _PLACES = {
+    "ConnectedFleet": ("cfplan.steering.connected_fleet", "ConnectedFleet"),
     "PathAnswer": ("cfplan.air.requests", "PathAnswer"),
     "PathVerdict": ("cfplan.air.requests", "PathVerdict"),
     "Plan": ("cfplan.preparation.plan_flight", "PlannedFlight"),
     "SteeredVehicle": ("cfplan.steering.steered_vehicle", "SteeredVehicle"),
     "Wish": ("cfplan.air.requests", "Wish"),
     "connect": ("cfplan.steering.connect", "connect"),
+    "connect_fleet": ("cfplan.steering.connected_fleet", "connect_fleet"),
     "load_limits": ("cfplan.safety.limits_file", "load_limits"),
     "load_path": ("cfplan.preparation.from_programs", "load_path"),
     "plan": ("cfplan.preparation.from_programs", "plan"),

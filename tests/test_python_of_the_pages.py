@@ -14,6 +14,7 @@ REPOSITORY = Path(__file__).parents[1]
 RUN_BY = {  # what a page shows, by the test that runs it
     "docs/contributing.md": "tests/test_contributing_page.py",
     "docs/export.md": "tests/integration/test_exports_by_scripts.py",
+    "docs/fleets.md": "tests/integration/test_fleet_in_real_time.py",
     "docs/python.md": "tests/test_python_of_the_pages.py",
     "docs/steering.md": "tests/test_python_of_the_pages.py",
 }

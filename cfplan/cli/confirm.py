@@ -14,26 +14,30 @@ from cfplan.safety.space import inside
 from cfplan.steering.starting_vehicle import SIMULATED
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from cfplan.cli.recorded_flight import Prepared
 
 FIRST_SPEED = 0.3  # speed factor at which a path should be flown first
 
 
-def confirmed(prepared: "Prepared", uri: str, records: Path, *, yes: bool, speed_factor: float | None) -> bool:
-    """Return whether to fly: always for a virtual vehicle or with --yes, otherwise as the user answers.
+def confirmed(
+    prepared: "Mapping[str, Prepared]", name: str, records: Path, *, yes: bool, speed_factor: float | None
+) -> bool:
+    """Return whether to fly: always for virtual vehicles or with --yes, otherwise as the user answers.
 
-    Raises InputError if standard input is not a terminal.
+    `prepared` has the flight of each vehicle by its URI. Raises InputError if standard input is not a terminal.
     """
-    if yes or uri.startswith(SIMULATED):
+    if yes or all(uri.startswith(SIMULATED) for uri in prepared):
         return True
-    name = prepared.planned.name
-    click.echo(describe(prepared, uri), err=True)
+    for uri, each in prepared.items():
+        click.echo(describe(each, uri), err=True)
     if not flown_before(name, records) and (speed_factor is None or speed_factor > FIRST_SPEED):
         click.echo(
             f"No flight of {name!r} on hardware is in {records}: fly it with --speed {FIRST_SPEED} first.", err=True
         )
     if not sys.stdin.isatty():
-        raise InputError("not a terminal: cannot ask for confirmation", where=uri, hint="--yes")
+        raise InputError("not a terminal: cannot ask for confirmation", where=", ".join(prepared), hint="--yes")
     if click.confirm("Fly?", err=True):
         return True
     click.echo("not flown", err=True)
@@ -71,8 +75,9 @@ def flown_before(name: str, records: Path) -> bool:
     """Return whether there is a record of a complete flight on hardware along a path of this name."""
     from cfplan.recording.record import SUMMARY_FILE
 
-    for file in records.glob(f"*/{SUMMARY_FILE}"):
-        if not re.search(rf"-{re.escape(name)}(-\d+)?$", file.parent.name):
+    for file in [*records.glob(f"*/{SUMMARY_FILE}"), *records.glob(f"*/*/{SUMMARY_FILE}")]:  # the latter of a fleet
+        flight = file.relative_to(records).parts[0]
+        if not re.search(rf"-{re.escape(name)}(-\d+)?$", flight):
             continue
         try:
             summary = json.loads(file.read_text(encoding="utf-8"))

@@ -100,13 +100,13 @@ def fly(
 
     steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
     options.check_place(uri, safety_file, records)
+    if path_or_plan is not None and lines is None and fleet.is_fleet(path_or_plan):
+        return _fly_fleet(path_or_plan, safety_file, mocap_uri, records, planning, steps, yes=yes)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    if fleet.is_fleet(path_or_plan):
-        return _fly_fleet(path_or_plan, safety_file, records, planning, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
@@ -115,26 +115,27 @@ def fly(
             from cfplan.cli.recorded_flight import fly_and_record
         flight_options = options.flight_options(planning, safety_file, path_or_plan)
         prepared = _preparation(on_board, after, planning, uri)(path_or_plan, limits, flight_options, steps)
-        if not confirmed(prepared, uri, records, yes=yes, speed_factor=planning["speed_factor"]):
+        name, speed_factor = prepared.planned.name, planning["speed_factor"]
+        if not confirmed({uri: prepared}, name, records, yes=yes, speed_factor=speed_factor):
             return int(ExitCode.ENDED_BY_OPERATOR)
         flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
     return _print_result(prepared, flown, as_json)
 
 
 def _fly_fleet(
-    file: Path, safety_file: Path | None, records: Path, planning: dict[str, Any], steps: Steps
+    file: Path, safety_file: Path | None, mocap: str | None, records: Path, planning: dict[str, Any], steps: Steps,
+    *, yes: bool,
 ) -> int:  # fmt: skip
     """Fly a fleet file. Raises InputError for options that a fleet does not have."""
     context = click.get_current_context()
     given = {
-        f"--{name.removesuffix('_uri').replace('_', '-')}": context.get_parameter_source(name)
-        is ParameterSource.COMMANDLINE
-        for name in ("uri", "mocap_uri", "on_board", "after", "live", "mavlink")
+        f"--{name.replace('_', '-')}": context.get_parameter_source(name) is ParameterSource.COMMANDLINE
+        for name in ("uri", "on_board", "after", "live", "mavlink")
     }
     fleet.refuse_flight_options(given)
     with steps.waiting("loading planners and simulator"):
         from cfplan.cli.fleet_flight import fly_fleet
-    return fly_fleet(file, safety_file, records, planning, steps)
+    return fly_fleet(file, safety_file, mocap, records, planning, steps, yes=yes)
 
 
 def _preparation(

@@ -29,7 +29,6 @@ from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 
 TRACKING = 0.05  # m that a vehicle may be off its path; `apart` has it for two vehicles, and a tube needs neither
-FLY_ON = False  # after the loss of another vehicle: the conductor lets all brake
 _LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"
 
 
@@ -206,7 +205,7 @@ def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
         return tubes[id(plan)][1]
 
     stop = stop_clock(RATE)[0] / RATE
-    return LossModel(tube, stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart), FLY_ON)
+    return LossModel(tube, stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))
 
 
 def _given_way(plan: Plan) -> Plan:

@@ -2,6 +2,8 @@
 
 __all__ = [
     "connect",
+    "connected_fleet",
+    "fleet_addresses",
     "fleet_room",
     "flight_in_progress",
     "real_time_steering",

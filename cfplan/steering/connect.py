@@ -52,7 +52,7 @@ def connect(
     check_uris(uri, mocap)
     if stepped and (not uri.startswith(SIMULATED) or mocap is not None):
         raise InputError("only the virtual vehicle flies on a stepped clock", where=uri, hint="leave out stepped")
-    limits = _limits(safety)
+    limits = find_limits(safety)
     flight: FlightInProgress
     if stepped:
         flight = SteppedSteering(limits, more_orders=more_orders)
@@ -63,7 +63,8 @@ def connect(
     return SteeredVehicle(flight, limits, uri=uri, name=name, records=folder, on_record=on_record)
 
 
-def _limits(safety: Limits | Path | str | None) -> Limits:
+def find_limits(safety: Limits | Path | str | None) -> Limits:
+    """Return limits, those of a file, or those of the nearest safety.yaml. Raises InputError if there are none."""
     if isinstance(safety, Limits):
         return safety
     if safety is not None:

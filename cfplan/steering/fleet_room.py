@@ -6,10 +6,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from types import TracebackType
 
-from cfplan.errors import InputError
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.mocap.source import pose_source
-from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.safety.limits import Limits
 from cfplan.simulation.lab.lab import Lab, launch_lab
 from cfplan.simulation.lab.room import RoomSettings, lab_variable
@@ -28,26 +26,6 @@ class VehiclePlace:
     body: str
     position: tuple[float, float]  # m, on the floor
     yaw: float = 0.0  # rad
-
-
-def virtual_addresses(fleet: FleetFile) -> dict[str, str]:
-    """Return the address of each vehicle by its name: that of the file, or sim://0, sim://1, … where it has none.
-
-    Raises InputError where two have one address, or one is no virtual vehicle: hardware does not fly in fleets yet.
-    """
-    found: dict[str, str] = {}
-    for number, vehicle in enumerate(fleet.vehicles):
-        uri = vehicle.uri or f"{SIMULATED}{number}"
-        if not uri.startswith(SIMULATED):
-            raise InputError(
-                f"{vehicle.name} is no virtual vehicle: fleets do not fly on hardware yet",
-                where=uri,
-                hint="leave `uri` out to fly the fleet virtually; `cfplan fly` flies one vehicle on its own",
-            )
-        if uri in found.values():
-            raise InputError(f"two vehicles have the address {uri}", where=fleet.name, hint="give each its own")
-        found[vehicle.name] = uri
-    return found
 
 
 class FleetRoom:

@@ -53,7 +53,7 @@ def terminal(monkeypatch):
 def ask(mission, records, uri=RADIO, yes=False, speed_factor=None):
     lost = simulate_link_loss(mission.payloads, mission.limits)
     prepared = SimpleNamespace(planned=SimpleNamespace(name="eight", duration=1.0), mission=mission, link_loss=lost)
-    return confirm.confirmed(prepared, uri, records, yes=yes, speed_factor=speed_factor)
+    return confirm.confirmed({uri: prepared}, "eight", records, yes=yes, speed_factor=speed_factor)
 
 
 def record(records, folder, exit_code=0, uri=RADIO):

@@ -79,25 +79,6 @@ def test_the_figure_of_a_fleet_has_its_paths_distances_and_conflict_map(cfplan, 
     assert "--force" in cfplan(*words).err
 
 
-@pytest.mark.parametrize(
-    ("lines", "what"),
-    [
-        ("  a: {path: line.yaml, uri: 'radio://0/80/2M/E7E7E7E7E7'}\n", "no virtual vehicle"),
-        ("  a: {path: line.yaml, uri: 'sim://1'}\n", "two vehicles have the address sim://1"),
-        ("  a: {path: line.yaml, body: b}\n", "two vehicles have the body 'b'"),
-    ],
-)
-def test_vehicles_that_cannot_be_told_apart_or_are_not_virtual_do_not_fly(
-    cfplan, fleet_file, safety_file, tmp_path, lines, what
-):
-    fleet_file.write_text(fleet_file.read_text().replace("  a: {path: line.yaml}\n", lines))
-    ended = cfplan("fly", fleet_file, "--safety", safety_file(), "--records", tmp_path / "records")
-    assert ended.code == 2
-    assert what in ended.err
-    assert "hint" in ended.err
-    assert not (tmp_path / "records").exists()
-
-
 def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     ended = cfplan("check", fleet_file, "--safety", safety_file())
     assert ended.code == 0
@@ -111,7 +92,7 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     [
         ("plan", ["-o", "a.parquet"], "plan files are not supported"),
         ("fly", ["--records", ".", "--on-board"], "do not fly with --on-board"),
-        ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7", "--mocap", "vicon://10.0.0.1/a"], "--uri"),
+        ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "do not fly with --uri"),
         ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
     ],
 )

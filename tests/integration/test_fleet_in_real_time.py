@@ -2,7 +2,9 @@
 
 import json
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,8 +17,8 @@ import pages
 import pytest
 from septic_flight import septic_payloads
 
-from cfplan.errors import ExitCode
-from cfplan.flight.fleet.conductor import ConductedFlight
+from cfplan.errors import ExitCode, FlightEndedError, InputError, RequestRefusedError
+from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
 from cfplan.flight.fleet.fly_together import FleetPilot, fly_together
 from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.mission import Mission
@@ -27,6 +29,7 @@ from cfplan.flight.telemetry import Phase, PhaseEntered
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.downwash import contacts
 from cfplan.simulation.lab.sim_driver import SimDriver
+from cfplan.steering.connected_fleet import connect_fleet
 from cfplan.steering.fleet_room import FleetRoom, VehiclePlace
 
 pytestmark = [pytest.mark.integration, pytest.mark.slow]
@@ -64,8 +67,9 @@ def fly_two(react=lambda name, message, pilots: None):
             )
             for place in places
         ]  # fmt: skip
+        conductor = Conductor([pilot.flight for pilot in pilots], 0.3)
         outcome = fly_together(
-            pilots, 0.3, listen=lambda name, message: react(name, message, processes), keyboard=keyboard
+            pilots, conductor, listen=lambda name, message: react(name, message, processes), keyboard=keyboard
         )
         return outcome, {name: room.lab.truth(number) for number, name in enumerate(NAMES)}
 
@@ -111,3 +115,64 @@ def test_a_fleet_lands_as_it_is_shown(tmp_path, line):
     (flight,) = tmp_path.iterdir()
     vehicles = json.loads(ended.stdout)["vehicles"]
     assert len(vehicles) == len([each for each in flight.iterdir() if each.is_dir()]) == 2
+
+
+def test_a_program_flies_a_fleet_as_the_page_shows(tmp_path, monkeypatch, capsys):
+    shutil.copytree(REPOSITORY / "flights", tmp_path / "flights")
+    shutil.copy(REPOSITORY / "safety.yaml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    page = (REPOSITORY / "docs" / "fleets.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
+    names: dict = {}
+    exec(block, names)
+    fleet = names["fleet"]
+    assert fleet.outcome.exit_code is ExitCode.OK, fleet.outcome.ends
+    assert fleet.outcome.nearest > fleet.plan.apart - 0.1
+    assert set(fleet.summary) == {"weave", "short"}
+    assert "weave" in capsys.readouterr().out
+
+
+def narrow_room(folder: Path, *uris: str) -> Path:
+    """Write a fleet of two lines 1 m apart; return its file."""
+    for number, name in enumerate(NAMES):
+        (folder / f"{name}.yaml").write_text(
+            f"waypoints: [[0, {number}, 0.8], [0.6, {number}, 0.8]]\nshape: min-snap\n"
+        )
+    addresses = [f", uri: '{uri}'" for uri in uris] or ["", ""]
+    lines = [f"  {name}: {{path: {name}.yaml{uri}}}\n" for name, uri in zip(NAMES, addresses, strict=True)]
+    (folder / "fleet.yaml").write_text("vehicles:\n" + "".join(lines))
+    return folder / "fleet.yaml"
+
+
+def test_a_fleet_with_addresses_flies_by_the_poses_of_a_motion_capture_system(tmp_path):
+    places = [VehiclePlace(f"sim://{number}", name, (0.0, float(number))) for number, name in enumerate(NAMES)]
+    with FleetRoom(places, LIMITS) as room:
+        mocap = room.lab.mocap_uri.rpartition("/")[0]
+        file = narrow_room(tmp_path, *(f"udp://127.0.0.1:{port}" for port in room.lab.ports))
+        with connect_fleet(file, mocap=mocap, safety=LIMITS, records=None) as fleet:
+            with pytest.raises(InputError, match="take_off"):
+                fleet.fly()
+            fleet.take_off()
+            for change in (fleet.replace, fleet.fly, fleet.extend, fleet.stop, fleet.slower, fleet.ask, fleet.request):
+                with pytest.raises(RequestRefusedError, match="in the air"):
+                    change([[0, 0, 1]])
+            assert not fleet.begun
+            fleet.finish()
+            with pytest.raises(FlightEndedError):
+                fleet.fly()
+        assert fleet.outcome.exit_code is ExitCode.OK, fleet.outcome.ends
+        truths = {name: room.lab.truth(number) for number, name in enumerate(NAMES)}
+    assert_down(truths)
+    assert all(truth.position[:, 0].max() > 0.5 for truth in truths.values())
+
+
+def test_swapped_bodies_are_refused_before_anything_is_armed(tmp_path):
+    places = [VehiclePlace(f"sim://{number}", name, (0.0, 1.0 - number)) for number, name in enumerate(NAMES)]
+    with FleetRoom(places, LIMITS) as room:
+        mocap = room.lab.mocap_uri.rpartition("/")[0]
+        file = narrow_room(tmp_path, *(f"udp://127.0.0.1:{port}" for port in room.lab.ports))
+        fleet = connect_fleet(file, mocap=mocap, safety=LIMITS, records=None)
+        with fleet, pytest.raises(FlightEndedError, match="swapped"):
+            fleet.take_off()
+        truths = [room.lab.truth(number) for number in range(2)]
+    assert all(not truth.motor.any() for truth in truths)

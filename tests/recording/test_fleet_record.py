@@ -14,7 +14,7 @@ from cfplan.flight.telemetry import Phase, PoseReceived
 from cfplan.recording.fleet_record import distances_to_others, is_fleet_record, read_fleet_record, write_fleet_file
 from cfplan.recording.record import FLIGHT_FILE
 from cfplan.recording.rerun.fleet_view import write_fleet
-from cfplan.recording.writer import RecordWriter
+from cfplan.recording.writer import RecordWriter, write_summary
 
 ASIDE = np.array([1.0, 0.0, 0.3])  # m, of the second vehicle from the first
 LATER = 1.5  # s, delay of the second vehicle's start
@@ -146,6 +146,21 @@ def test_a_replay_holds_all_vehicles(flown, tmp_path):
     ):
         assert entity in content
     assert "--force" in run("replay", flown, "--save", file).exception.hint
+
+
+def test_a_list_of_flights_has_the_flight_of_a_fleet_in_one_row(copied):
+    reasons = {"left": "landed", "right": "the battery is low"}
+    for folder in copied.glob("*-*"):
+        name = folder.name.rpartition("-")[2]
+        summary = {"outcome": {"reason": reasons[name]}, "max_deviation": 0.04 if name == "left" else 0.07}
+        write_summary(folder, summary)
+    listed = run("replay", copied.parent)
+    assert listed.exit_code == 0
+    row = " ".join(next(line for line in listed.output.splitlines() if line.startswith("two")).split())
+    for text in ("2 vehicles", *reasons.values(), "7.0 cm"):
+        assert text in row
+    (document,) = json.loads(run("replay", copied.parent, "--json").output)["records"]
+    assert {each["outcome"]["reason"] for each in document["vehicles"]} == set(reasons.values())
 
 
 def test_a_figure_is_of_one_vehicle(flown, tmp_path):

@@ -6,7 +6,8 @@ Each vehicle has its own pilot, which may end its flight at any time. The conduc
     arming        until every vehicle is armed
     take-off      one after another: the next when poses show that the one before has risen, so that bodies that are
                   swapped in motion capture are noticed while one vehicle flies
-    at the start  until every vehicle hovers at its start; then all have the same time at which the fleet begins
+    at the start  until every vehicle hovers at its start, and `holds` is false; then all have the same time at which
+                  the fleet begins
     flying        each on its own clock, which is that of this computer
     braking       all vehicles brake along their paths and land, once one of them leaves its plan, ends early, does not
                   answer, or is nearer to another than the fleet's certificate allows
@@ -99,9 +100,10 @@ class _Vehicle:
 class Conductor:
     """Decides when each vehicle may arm, take off and begin, and when all brake."""
 
-    def __init__(self, flights: Sequence[ConductedFlight], apart: float):
+    def __init__(self, flights: Sequence[ConductedFlight], apart: float, *, holds: bool = False):
         self._vehicles = {flight.name: _Vehicle(flight) for flight in flights}
         self._apart = apart  # m between columns, as certified
+        self.holds = holds  # all hover at their starts until a program sets it to false
         self.brakes = ""  # why all brake; the first reason stays
         self.begins = math.inf  # s, when the fleet's clock is at 0
         self.nearest = math.inf  # m between the columns of two vehicles in the air, so far
@@ -119,6 +121,21 @@ class Conductor:
         if any(Phase.TAKE_OFF in vehicle.cleared for vehicle in vehicles):
             return Stage.TAKE_OFF
         return Stage.ARMING if any(vehicle.cleared for vehicle in vehicles) else Stage.PREFLIGHT
+
+    @property
+    def flights(self) -> tuple[ConductedFlight, ...]:
+        """Return the vehicles, in the order in which they take off."""
+        return tuple(vehicle.flight for vehicle in self._vehicles.values())
+
+    @property
+    def ready(self) -> bool:
+        """Return whether every vehicle hovers at its start, and none has begun."""
+        return self._all_wait_for(Phase.STREAM)
+
+    def position(self, name: str) -> Triple | None:
+        """Return where a vehicle was seen last, m; None before its first pose."""
+        poses = self._vehicles[name].poses
+        return poses[-1].position if poses else None
 
     def hear(self, name: str, message: PilotMessage | FlightEnded | Telemetry, now: float) -> None:
         """Take what a vehicle's pilot says at a time, s."""
@@ -193,7 +210,7 @@ class Conductor:
             waiting = [vehicle for vehicle in vehicles if Phase.TAKE_OFF not in vehicle.cleared]
             if waiting and all(vehicle.risen for vehicle in vehicles if vehicle not in waiting):
                 waiting[0].cleared[Phase.TAKE_OFF] = now
-        if self._all_wait_for(Phase.STREAM):
+        if self.ready and not self.holds:
             self.begins = now + START_LEAD
             for vehicle in vehicles:
                 vehicle.cleared[Phase.STREAM] = self.begins + vehicle.flight.delay
@@ -207,6 +224,7 @@ class Conductor:
             vehicle.stood = vehicle.poses[-1].position
             beside = math.dist(vehicle.stood[:2], vehicle.flight.start[:2])
             if not beside <= STANDS_WITHIN:
+                self._require_not_swapped(vehicle, vehicle.stood, vehicles)
                 self._brake(
                     f"{vehicle.name} stands {beside:.2f} m beside its start at "
                     f"({vehicle.flight.start[0]:.2f}, {vehicle.flight.start[1]:.2f}) m, at most {STANDS_WITHIN:g} m"
@@ -217,3 +235,12 @@ class Conductor:
             distance = math.dist(a.stood[:2], b.stood[:2])
             if not distance >= self._apart - 2.0 * TRACKING:
                 self._brake(f"{a.name} and {b.name} stand {distance:.2f} m apart, which must be {self._apart:g} m")
+
+    def _require_not_swapped(self, vehicle: _Vehicle, stood: Triple, vehicles: Sequence[_Vehicle]) -> None:
+        """End the flight on the floor if a vehicle stands under the start of another."""
+        for other in vehicles:
+            if other is not vehicle and math.dist(stood[:2], other.flight.start[:2]) <= STANDS_WITHIN:
+                self._brake(
+                    f"{vehicle.name} stands at the start of {other.name}: the two vehicles, or their bodies in motion "
+                    "capture, are swapped"
+                )

@@ -5,7 +5,7 @@ the operator's orders to the pilots. If it dies, each pilot notices and lands.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
@@ -59,20 +59,27 @@ class FleetOutcome:
 _BRAKES_WITH = "the fleet brakes"
 
 
-def fly_together(pilots: Sequence[FleetPilot], apart: float, *, listen: Listen, keyboard: Keyboard) -> FleetOutcome:
-    """Fly missions that are certified to keep `apart`, m, and return when all vehicles are down.
+def fly_together(
+    pilots: Sequence[FleetPilot],
+    conductor: Conductor,
+    *,
+    listen: Listen,
+    keyboard: Keyboard,
+    more_orders: Callable[[], Iterable[Order]] = tuple,
+) -> FleetOutcome:
+    """Fly missions as their conductor allows, and return when all vehicles are down.
 
-    `listen` gets every message of every pilot, in order; what it raises is raised here after all have landed. Call from
-    the main thread, with a keyboard that is entered, so that Ctrl-C lands all.
+    `listen` gets every message of every pilot, in order; what it raises is raised here after all have landed. The
+    keyboard is one that was entered in the main thread, so that Ctrl-C lands all. `more_orders` returns the orders
+    since its last call that came neither by key nor by signal.
     """
-    conductor = Conductor([pilot.flight for pilot in pilots], apart)
     fleet = _Fleet(pilots, conductor, listen)
     with contextlib.ExitStack() as processes:
         for pilot in pilots:
             processes.enter_context(pilot.process)
             pilot.process.assign(pilot.mission, pilot.uri, pilot.pose_source, conducted=True)
         while conductor.stage is not Stage.ENDED:
-            fleet.pass_on(keyboard)
+            fleet.pass_on([*keyboard.orders(), *more_orders()])
     if fleet.failure is not None:
         raise fleet.failure
     return FleetOutcome(fleet.outcomes, fleet.ends, conductor.brakes, conductor.begins, conductor.nearest)
@@ -89,14 +96,14 @@ class _Fleet:
         self.ends: dict[str, FlightEnded] = {}
         self.failure: BaseException | None = None  # of the listener
 
-    def pass_on(self, keyboard: Keyboard) -> None:
-        """Pass on what has come, at most after a moment."""
+    def pass_on(self, orders: Iterable[Order]) -> None:
+        """Pass on orders, and what has come from pilots, at most after a moment."""
+        for order in orders:
+            self._order(order)
         ready = set(wait([connection for _, connection in self._connections()], _PERIOD))
         for name, connection in self._connections():
             if connection in ready and name not in self.ends:
                 self._take(name, connection)
-        for order in keyboard.orders():
-            self._order(order)
         self._conduct(REAL_CLOCK.now())
 
     def _connections(self) -> Iterator[tuple[str, Connection]]:

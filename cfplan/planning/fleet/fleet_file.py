@@ -2,6 +2,7 @@
 
 apart: 0.30          # m between the vertical columns of any two vehicles
 skew: 0.03           # s by which their clocks may differ
+addresses: crazyflies.yaml   # of vehicles without `uri`; also a swarm file of cfcli
 lost: refuse         # a fleet in which a lost vehicle may come too near to another; warn: plan it all the same
 vehicles:
   left: {path: ../circle.yaml, place: {x: -1.0}}
@@ -21,6 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
 from cfplan.geometry.path_file import PathFile, PathPlace, load_path_file
+from cfplan.planning.fleet.address_file import read_address_file
 
 FEWEST, MOST = 2, 6  # vehicles
 APART = 0.30  # m: downwash is below 5 % of weight at 0.20 m, and each vehicle may be 0.05 m off its path
@@ -72,6 +74,7 @@ class _Content(BaseModel):
     apart: float = Field(default=APART, ge=0.2, le=5.0)
     skew: float = Field(default=SKEW, ge=0.0, le=0.2)
     lost: Literal["refuse", "warn"] = "refuse"
+    addresses: str = ""  # name of a file with the addresses of vehicles without `uri`
     vehicles: dict[str, _Vehicle]
 
 
@@ -89,8 +92,8 @@ def load_fleet_file(file: pathlib.Path) -> FleetFile:
     """Read a fleet file and the path file of each vehicle.
 
     Raises:
-        InputError: a mistake in it or in a path file; too few or too many vehicles; two with one address or one body;
-            two whose starts or whose ends are closer than they must keep apart.
+        InputError: a mistake in it, in a path file or in the file of addresses; too few or too many vehicles; two with
+            one address or one body; two whose starts or whose ends are closer than they must keep apart.
     """
     content, places = read_yaml_with_places(file, _Content)
     if not FEWEST <= len(content.vehicles) <= MOST:
@@ -113,6 +116,7 @@ def _dongle(uri: str) -> str:
 
 
 def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterator[FleetVehicle]:
+    listed = read_address_file(folder / content.addresses) if content.addresses else None
     for name, each in content.vehicles.items():
         if not name.isprintable() or not 0 < len(name) <= 40:
             raise InputError(
@@ -127,7 +131,8 @@ def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterat
                 where=places.where(_KEY, name, "path"),
                 hint="the name is relative to the fleet file",
             )
-        yield FleetVehicle(name, load_path_file(source).placed(*each.place.motion), each.uri, each.body)
+        uri = each.uri or (listed.uri(name, places.where_key(_KEY, name)) if listed is not None else "")
+        yield FleetVehicle(name, load_path_file(source).placed(*each.place.motion), uri, each.body)
 
 
 def _check_pair(a: FleetVehicle, b: FleetVehicle, fleet: FleetFile, places: Places) -> None:

@@ -36,12 +36,8 @@ class Hazards:
             a, b = (_own_times(members[n].plan.trajectory.duration) for n in (i, j))
             own_a, own_b = (each.ravel() for each in np.meshgrid(a, b, indexing="ij"))
             found = np.minimum(
-                distances(tubes[i], own_a, (members[j].plan, own_b), lost.stop, skew, far=far)[: lost.reactions].max(
-                    axis=0
-                ),
-                distances(tubes[j], own_b, (members[i].plan, own_a), lost.stop, skew, far=far)[: lost.reactions].max(
-                    axis=0
-                ),
+                distances(tubes[i], own_a, (members[j].plan, own_b), lost.stop, skew, far=far),
+                distances(tubes[j], own_b, (members[i].plan, own_a), lost.stop, skew, far=far),
             )
             if any(groups_among(lost.together, (i, j))):
                 found = np.minimum(found, tubes_apart(tubes[i], own_a, tubes[j], own_b, skew))

@@ -1,10 +1,9 @@
 """The certificate of lost vehicles: where a vehicle may be after its link is lost, and how near the others come.
 
 A lost vehicle no longer follows its path. Its tube encloses it at each time until it lies on the floor; there is one
-tube for each setpoint after which the link may be lost. The others either all brake once the loss is noticed, or all
-fly on: both keep them apart from each other, by the certificate of separation. If both are possible, the one that keeps
-farther away counts at each moment. Vehicles of one dongle are lost together, and their tubes are compared with each
-other too.
+tube for each setpoint after which the link may be lost. The others all brake once the loss is noticed, which keeps them
+apart from each other, by the certificate of separation. Vehicles of one dongle are lost together, and their tubes are
+compared with each other too.
 
 While a lost vehicle is in the air, the others keep away from its tube at all heights. Once it lies, they may pass over
 it, but none may stop or end above it.
@@ -31,7 +30,6 @@ after the last setpoint: answers to pings, ten a second, must be missing for 0.5
 pilot is noticed after 0.5 s. The conductor's tick and its orders take 0.1 s at most."""
 _SAMPLE = 0.005  # s of a plan, from one compared place to the next
 _BETWEEN = 1e-4  # m, as in separation.py
-REACTIONS = ("the others brake", "the others fly on")
 _RESTS = 1e3  # s before its start, of a vehicle that waits for long
 
 
@@ -75,11 +73,11 @@ class Loss:
 
 
 class _Ways(NamedTuple):
-    """How far along its plan another vehicle is after a loss, for each reaction and part of the time."""
+    """How far along its plan another vehicle is after a loss, for each part of the time."""
 
-    first: NDArray  # (2, S) int, samples from the place at the loss
-    last: NDArray  # (2, S) int
-    rest: NDArray  # (2, 2) int, first and last where it rests
+    first: NDArray  # (S,) int, samples from the place at the loss
+    last: NDArray  # (S,) int
+    rest: NDArray  # (2,) int, first and last where it rests
     far: float  # m, the largest distance that matters
 
 
@@ -91,12 +89,6 @@ class LossModel:
     stop: NDArray  # (M,) s, how far a stop goes on along a plan, at the rate of setpoints
     together: tuple[tuple[int, ...], ...]  # numbers of the vehicles that share a dongle, of two or more
     clearance: float  # m, from a tube to the other columns
-    fly_on: bool = True  # whether the others may fly on, where that keeps farther away
-
-    @property
-    def reactions(self) -> int:
-        """Return how many of the REACTIONS count."""
-        return 2 if self.fly_on else 1
 
     def losses(self, members: Sequence[FleetMember], numbers: Sequence[int], skew: float) -> tuple[Loss, ...]:
         """Return the worst moment to lose each of some vehicles of a fleet, and each dongle, the nearest first.
@@ -106,10 +98,9 @@ class LossModel:
         tubes, count = [self.tube(member.plan) for member in members], len(members)
         times = np.arange(0, int(np.ceil(max(member.end for member in members) * tubes[0].rate)) + 1) / tubes[0].rate
         own = [times - member.delay for member in members]
-        away = np.full((count, count, self.reactions, len(times)), np.inf)  # lost, other, reaction, time
+        away = np.full((count, count, len(times)), np.inf)  # lost, other, time
         for i, j in itertools.permutations(range(count), 2):
-            found = distances(tubes[i], own[i], (members[j].plan, own[j]), self.stop, skew)
-            away[i, j] = found[: self.reactions]
+            away[i, j] = distances(tubes[i], own[i], (members[j].plan, own[j]), self.stop, skew)
         worst = []
         for group in (*((n,) for n in range(count)), *groups_among(self.together, numbers)):
             table = np.full_like(away, np.inf)
@@ -122,21 +113,19 @@ class LossModel:
         return tuple(sorted(worst, key=lambda each: each.distance))
 
     def _worst(self, group: tuple[int, ...], away: NDArray, times: NDArray, members: Sequence[FleetMember]) -> Loss:
-        """Return the moment at which the better reaction keeps least away; `away` has lost, other, reaction, time."""
+        """Return the moment at which others are least away; `away` has lost, other, time."""
         kept = away.min(axis=(0, 1))
-        best = kept.max(axis=0)
-        at = int(best.argmin())
-        reaction = int(kept[:, at].argmax())
-        i, j = divmod(int(away[:, :, reaction, at].argmin()), len(members))
+        at = int(kept.argmin())
+        i, j = divmod(int(away[:, :, at].argmin()), len(members))
         x, y = members[i].columns(times[at : at + 1])[0].tolist()
         return Loss(
             tuple(members[number].name for number in group),
             (members[i].name, members[j].name),
-            REACTIONS[reaction] if len(group) < len(members) else "all are lost",
-            max(float(kept[reaction, at]), 0.0),
+            "the others brake" if len(group) < len(members) else "all are lost",
+            max(float(kept[at]), 0.0),
             (x, y),
             float(times[at]),
-            float(np.mean(~inside(self.clearance - best))),
+            float(np.mean(~inside(self.clearance - kept))),
         )
 
 
@@ -151,7 +140,7 @@ def groups_among(together: Sequence[tuple[int, ...]], numbers: Sequence[int]) ->
 def distances(
     tube: Tube, lost: NDArray, other: tuple[Plan, NDArray], stop: NDArray, skew: float, *, far: float = np.inf
 ) -> NDArray:
-    """Return the least distance from a tube to the column of another vehicle that brakes or flies on, (2, N) m.
+    """Return the least distance from a tube to the column of another vehicle that brakes, (N,) m.
 
     `lost`, (N,) s, are own times of the vehicle when its link is lost; `other` are the plan and own times of the other.
     Distances above `far`, m, are returned as that.
@@ -169,13 +158,12 @@ def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
     begin = tube.part * np.arange(tube.boxes.shape[2]) - skew
     end = begin + tube.part + 2.0 * skew
     soonest, latest = NOTICED
-    first = np.stack([_braked(begin, soonest, stop, tube.rate), begin])
-    last = np.stack([_braked(end, latest, stop, tube.rate), end])
-    rest = np.array([[soonest + stop[-1] - skew, latest + stop[-1] + skew], [2.0 * _RESTS, 2.0 * _RESTS]])
+    first, last = _braked(begin, soonest, stop, tube.rate), _braked(end, latest, stop, tube.rate)
+    rests = soonest + stop[-1] - skew, latest + stop[-1] + skew
     return _Ways(
         np.floor(first / _SAMPLE).astype(np.int64),
         np.ceil(last / _SAMPLE).astype(np.int64),
-        np.stack([np.floor(rest[:, 0] / _SAMPLE), np.ceil(rest[:, 1] / _SAMPLE)], axis=1).astype(np.int64),
+        np.array([np.floor(rests[0] / _SAMPLE), np.ceil(rests[1] / _SAMPLE)]).astype(np.int64),
         far,
     )
 
@@ -187,8 +175,8 @@ def _braked(times: NDArray, begins: float, stop: NDArray, rate: float) -> NDArra
 
 @njit(nogil=True, error_model="numpy")
 def _least(boxes: NDArray, rows: NDArray, samples: NDArray, per_sample: float, begin: NDArray, ways: _Ways) -> NDArray:
-    """Return the least distances, (2, N) m, of boxes to samples, (W, 2), which are `per_sample`, m, apart at most."""
-    out = np.full((2, len(rows)), ways.far)
+    """Return the least distances, (N,) m, of boxes to samples, (W, 2), which are `per_sample`, m, apart at most."""
+    out = np.full(len(rows), ways.far)
     for n in range(len(rows)):
         for way in range(boxes.shape[0]):
             row = rows[n]
@@ -196,14 +184,12 @@ def _least(boxes: NDArray, rows: NDArray, samples: NDArray, per_sample: float, b
                 lies = boxes[way, row, part, 1, 2] <= 0.0
                 low, high = boxes[way, row, part, 0], boxes[way, row, part, 1]
                 box = low[0], low[1], high[0], high[1]
-                for reaction in range(2):
-                    first, last = ways.first[reaction, part], ways.last[reaction, part]
-                    if lies:
-                        first, last = ways.rest[reaction, 0], ways.rest[reaction, 1]
-                    first = min(max(begin[n] + first, 0), len(samples) - 1)
-                    last = min(max(begin[n] + last, 0), len(samples) - 1)
-                    least = out[reaction, n]
-                    out[reaction, n] = _nearest_sample(box, samples, per_sample, first, last, least)
+                first, last = ways.first[part], ways.last[part]
+                if lies:
+                    first, last = ways.rest[0], ways.rest[1]
+                first = min(max(begin[n] + first, 0), len(samples) - 1)
+                last = min(max(begin[n] + last, 0), len(samples) - 1)
+                out[n] = _nearest_sample(box, samples, per_sample, first, last, out[n])
                 if lies:
                     break
     return out

@@ -84,7 +84,8 @@ def test_a_vehicle_that_fails_preflight_keeps_all_on_the_floor():
 
 
 @pytest.mark.parametrize(("place", "text"), [
-    ((0.25, 0.0, 0.0), "beside its start"), ((0.0, 0.0, 0.0), "beside its start"), ((0.5, 0.2, 0.0), "0.20 m beside"),
+    ((0.25, 0.0, 0.0), "beside its start"), ((0.0, 0.05, 0.0), "at the start of left"),
+    ((0.5, 0.2, 0.0), "0.20 m beside"),
 ])  # fmt: skip
 def test_a_vehicle_that_does_not_stand_under_its_start_keeps_all_on_the_floor(place, text):
     fleet = Fleet()
@@ -115,6 +116,28 @@ def test_all_begin_at_one_time_each_after_its_delay():
     assert fleet.go_on(1.0)["left"].cleared[Phase.STREAM] == begins
     assert fleet.conductor.stage is Stage.FLYING
     assert not braking(said)
+
+
+def test_bodies_that_are_swapped_on_the_floor_are_named_and_nothing_is_armed():
+    fleet = Fleet()
+    fleet.places = {"left": fleet.places["right"], "right": fleet.places["left"]}
+    fleet.go_on(0.1)
+    said = fleet.ask(Phase.ARM)
+    assert not cleared(said, Phase.ARM)
+    assert "left stands at the start of right" in said["left"].brakes
+    assert "swapped" in said["right"].brakes
+
+
+def test_vehicles_hover_at_their_starts_until_the_program_lets_them_begin():
+    fleet = Fleet()
+    fleet.conductor.holds = True
+    assert not cleared(fleet.fly(), Phase.STREAM)
+    assert fleet.conductor.ready
+    assert not cleared(fleet.go_on(5.0), Phase.STREAM)
+    fleet.conductor.holds = False
+    assert cleared(fleet.go_on(0.01), Phase.STREAM) == {"left", "right"}
+    assert fleet.conductor.begins == pytest.approx(fleet.now + START_LEAD)
+    assert not fleet.conductor.ready
 
 
 def test_all_brake_when_one_leaves_its_plan():

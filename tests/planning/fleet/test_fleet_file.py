@@ -95,3 +95,70 @@ def test_vehicles_of_one_dongle_are_known_by_their_addresses(fleet_file):
     )
     assert load_fleet_file(fleet_file(three)).dongles == {"0": (0, 1)}
     assert load_fleet_file(fleet_file(TWO)).dongles == {}
+
+
+CRAZYFLIES = """\
+fileversion: 3
+robots:
+  a:
+    enabled: true
+    uri: radio://0/80/2M/E7E7E7E701
+    initial_position: [0.0, 0.5, 0.0]
+    type: cf21  # see robot_types
+  b: {uri: radio://1/100/2M/E7E7E7E702, type: cf21}
+  spare: {enabled: false, uri: radio://0/80/2M/E7E7E7E703}
+robot_types:
+  cf21:
+    motion_capture: {tracking: librigidbodytracker, marker: default_single_marker}
+all:
+  firmware_params: {commander: {enHighLevel: 1}}
+"""
+SWARM = """\
+name: two
+units:
+  - uri: radio://0/80/2M/E7E7E7E701
+    name: a
+    description: Crazyflie 01
+  - {uri: radio://1/100/2M/E7E7E7E702, name: b}
+lighthouse: room.yaml
+"""
+NAMED = "addresses: addresses.yaml\n" + TWO.replace("uri: 'sim://0', ", "")
+
+
+@pytest.mark.parametrize("text", [CRAZYFLIES, SWARM])
+def test_addresses_come_from_a_file_of_crazyswarm2_or_cfcli(fleet_file, tmp_path, text):
+    (tmp_path / "addresses.yaml").write_text(text)
+    a, b = load_fleet_file(fleet_file(NAMED)).vehicles
+    assert (a.uri, b.uri) == ("radio://0/80/2M/E7E7E7E701", "radio://1/100/2M/E7E7E7E702")
+    own = load_fleet_file(fleet_file(NAMED.replace("body: one", "body: one, uri: 'usb://0'"))).vehicles[0]
+    assert own.uri == "usb://0"
+
+
+@pytest.mark.parametrize(
+    ("text", "what", "place"),
+    [
+        (None, "addresses.yaml", "addresses.yaml"),
+        ("", "empty", "addresses.yaml"),
+        ("crazyflies:\n  - id: 1\n", "neither `robots` nor `units`", "addresses.yaml"),
+        ("- a\n", "keys with values", "addresses.yaml"),
+        ("robots: 3\n", "robots", "addresses.yaml:1:"),
+        ("robots:\n  a: {enabled: true}\n", "'uri' is missing", "addresses.yaml:2:"),
+        ("robots:\n  a: {uri: 80}\n", "uri", "addresses.yaml:2:"),
+        (CRAZYFLIES.replace("true", "yes"), "enabled", "addresses.yaml:4:"),
+        (CRAZYFLIES.replace("true", "false"), "a is disabled", "addresses.yaml:3:"),
+        (CRAZYFLIES.replace("\n  b:", "\n  bb:"), "b is not in", "fleet.yaml:4:"),
+        (CRAZYFLIES.replace("radio://1/100/2M/E7E7E7E702", "radio://0/80/2M/E7E7E7E701"), "same uri", "fleet.yaml:4:"),
+        (SWARM.replace("name: b", "name: a"), "two units have the name 'a'", "addresses.yaml:6:"),
+        (SWARM.replace(", name: b", ""), "'name' is missing", "addresses.yaml:6:"),
+        (SWARM.replace("name: b", "name: c"), "b is not in", "fleet.yaml:4:"),
+        ("units: &all\n  - *all\n", "anchors", "addresses.yaml:1:"),
+    ],
+)
+def test_a_wrong_file_of_addresses_is_refused_with_its_place(fleet_file, tmp_path, text, what, place):
+    if text is not None:
+        (tmp_path / "addresses.yaml").write_text(text)
+    with pytest.raises(InputError) as refused:
+        load_fleet_file(fleet_file(NAMED))
+    assert what in str(refused.value)
+    assert refused.value.where.startswith(str(tmp_path / place))
+    assert refused.value.hint

@@ -29,13 +29,13 @@ def encoded(limits):
 def model(limits, encoded):
     """Make a model of lost vehicles, with those of one dongle."""
 
-    def make(*together, fly_on=False):
+    def make(*together):
         def tube(plan):
             payloads = encoded(plan).payloads
             boxes = link_loss_tubes(payloads, limits, np.arange(len(payloads)))
             return Tube(boxes, RATE, 0.001 * TUBE_PART)
 
-        return LossModel(tube, STOP, together, CLEARANCE, fly_on)
+        return LossModel(tube, STOP, together, CLEARANCE)
 
     return make
 
@@ -108,12 +108,6 @@ def test_drawn_vehicles_without_link_and_poses_keep_the_distance(coordinated, en
                 assert min(apart(way, each) for each in others) >= CLEARANCE - OFF_BOX
 
 
-def test_flying_on_counts_where_it_is_farther_away(coordinated, model):
-    braking, either = (model(fly_on=both).losses(coordinated, (0, 1), SKEW) for both in (False, True))
-    distance = [{each.vehicles: each.distance for each in found} for found in (braking, either)]
-    assert all(distance[1][name] >= distance[0][name] for name in distance[0])
-
-
 def test_the_vehicles_of_a_dongle_are_lost_together(crossing, coordinated, model):
     (alone,) = [each for each in model((0, 1)).losses(coordinated, (0, 1), SKEW) if len(each.vehicles) == 2]
     (together,) = [each for each in model((0, 1)).losses(crossing, (0, 1), SKEW) if len(each.vehicles) == 2]
@@ -131,9 +125,8 @@ def test_a_tube_is_compared_with_each_place_that_the_other_may_be_at(crossing):
     )
     tube, duration = Tube(box[None], RATE, 0.04), other.trajectory.duration
     own = np.array([-np.inf, 0.0, duration / 2, duration])
-    braking, flying = distances(tube, np.zeros(4), (other, own), STOP, SKEW)
+    braking = distances(tube, np.zeros(4), (other, own), STOP, SKEW)
     end = np.hypot(1.1, 0.5)
-    assert flying == pytest.approx([end, end, 0.5, end], abs=0.02)
     assert braking[0] == pytest.approx(end, abs=0.02)  # it waits where it starts
     assert braking[2] == pytest.approx(0.5, abs=0.02)
     box[..., 0, 0] = np.nan

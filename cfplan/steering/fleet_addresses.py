@@ -1,0 +1,116 @@
+"""The address of each vehicle of a fleet and its body in motion capture, checked before anything is planned."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from urllib.parse import quote
+
+from cfplan.errors import InputError
+from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
+from cfplan.flight.radio.uri import check_vehicle_uri, same_vehicle
+from cfplan.planning.fleet.fleet_file import FleetFile
+from cfplan.preparation.steps import OnStep
+from cfplan.safety.limits import PoseLimits
+from cfplan.steering.starting_vehicle import SIMULATED, look_at_hardware
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleAddress:
+    """The two names of a vehicle: by radio, and in motion capture."""
+
+    uri: str
+    body: str
+    mocap: str = ""  # URI of the body; empty in a virtual room, which has a virtual Vicon
+
+    @property
+    def virtual(self) -> bool:
+        return self.uri.startswith(SIMULATED)
+
+
+def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAddress]:
+    """Return the addresses of all vehicles by their names; a vehicle without `uri` is sim://0, sim://1, ….
+
+    Args:
+        fleet: the vehicles. One without `body` has its name as its body.
+        mocap: the motion capture system that sees all of them, as vicon://192.168.1.2; None for virtual vehicles.
+
+    Raises InputError if a URI is wrong, two vehicles have one address or one body, two share a dongle, some are virtual
+    and some are not, or they have no motion capture. Nothing is connected yet.
+    """
+    uris = {vehicle.name: vehicle.uri or f"{SIMULATED}{number}" for number, vehicle in enumerate(fleet.vehicles)}
+    bodies = {vehicle.name: vehicle.body or vehicle.name for vehicle in fleet.vehicles}
+    for uri in uris.values():
+        check_vehicle_uri(uri)
+    _require_all_virtual_or_none(fleet, mocap)
+    _require_different("address", uris, fleet)
+    _require_different("body", bodies, fleet)
+    for dongle, numbers in fleet.dongles.items():
+        sharing = [fleet.vehicles[number].name for number in numbers]
+        raise InputError(
+            f"{' and '.join(sharing)} share dongle {dongle}, which serves one vehicle",
+            where=uris[sharing[1]],
+            hint="plug in a dongle for each vehicle, and number them 0, 1, … after radio://",
+        )
+    return {name: VehicleAddress(uri, bodies[name], _body_uri(mocap, bodies[name])) for name, uri in uris.items()}
+
+
+def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, on_step: OnStep) -> None:
+    """Check that each dongle is available and each body seen, before anything is planned. Raises a CfplanError."""
+    for name, address in addresses.items():
+        if not address.virtual:
+            look_at_hardware(address.uri, address.mocap, limits, _named(name, on_step))
+
+
+def _named(name: str, on_step: OnStep) -> OnStep:
+    """Return a listener to steps that puts the vehicle's name before each."""
+    return lambda step, state, result: on_step(f"{name}: {step}", state, result)
+
+
+def _require_all_virtual_or_none(fleet: FleetFile, mocap: str | None) -> None:
+    hardware = [each for each in fleet.vehicles if each.uri and not each.uri.startswith(SIMULATED)]
+    virtual = [each for each in fleet.vehicles if each not in hardware]
+    if hardware and virtual:
+        raise InputError(
+            f"{virtual[0].name} is a virtual vehicle, and {hardware[0].name} is not",
+            where=fleet.name,
+            hint="give every vehicle its `uri`, or leave `uri` out for all to fly the fleet virtually",
+        )
+    if hardware and mocap is None:
+        raise InputError(
+            "these vehicles need a source of poses",
+            where=hardware[0].uri,
+            hint="name their motion capture, as --mocap vicon://192.168.1.2; leave out every `uri` to fly virtually",
+        )
+    if mocap is None:
+        return
+    if virtual:
+        raise InputError(
+            "virtual vehicles of a fleet have a virtual Vicon",
+            where=mocap,
+            hint="leave motion capture out, or give each vehicle its `uri` in the fleet file",
+        )
+    if body := parse_uri(mocap, subject_needed=False).subject:
+        raise InputError(
+            f"the body {body!r} cannot be that of every vehicle",
+            where=mocap,
+            hint=f"leave it out, as in {EXAMPLE.rpartition('/')[0]}; bodies stand in the fleet file",
+        )
+
+
+def _require_different(what: str, names: Mapping[str, str], fleet: FleetFile) -> None:
+    """Raise InputError if two vehicles have the same address or body."""
+    found: list[tuple[str, str]] = []
+    for name, value in names.items():
+        for other, before in found:
+            if value == before or (what == "address" and same_vehicle(value, before)):
+                raise InputError(
+                    f"{other} and {name} have the same {what}, {value!r}", where=fleet.name, hint="give each its own"
+                )
+        found.append((name, value))
+
+
+def _body_uri(mocap: str | None, body: str) -> str:
+    if mocap is None:
+        return ""
+    uri = f"{str(parse_uri(mocap, subject_needed=False)).rstrip('/')}/{quote(body, safe='')}"
+    parse_uri(uri, subject_needed=True)
+    return uri
