@@ -13,7 +13,7 @@ Each vehicle has its own pilot, which may end its flight at any time. The conduc
                   answer, or is nearer to another than the fleet's certificate allows
 
 It is a pure core: a driver tells it what it hears, and passes on what it says. Its silence is an order too: a pilot
-that has not heard it for a second brakes.
+that has not heard it for `CONDUCTOR_SILENT` brakes.
 """
 
 import itertools
@@ -33,6 +33,7 @@ STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stan
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
 PILOT_SILENT = 0.5  # s without a message of a pilot whose vehicle has passed preflight
 START_LEAD = 0.5  # s from the last vehicle's readiness to the start of all, for the message to arrive
+"""Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
