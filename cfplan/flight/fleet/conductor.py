@@ -27,16 +27,27 @@ import numpy as np
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.conducted import ClearanceAsked, ConductorMessage, PilotMessage, PlanLeft
-from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, Telemetry, Triple
+from cfplan.flight.telemetry import (
+    Estimate,
+    Event,
+    Level,
+    Phase,
+    PhaseEntered,
+    PoseReceived,
+    Telemetry,
+    Triple,
+    VehicleStatus,
+)
 
 STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
-PILOT_SILENT = 0.5  # s without a message of a pilot whose vehicle has passed preflight
+PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 0.5  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
+_OF_THE_RADIO = (Estimate, VehicleStatus, Event)  # may come from another thread of the pilot, whose tick loop hangs
 _DESCENDING, _DOWN = (Phase.LAND, Phase.DISARM, Phase.CLOSED), (Phase.DISARM, Phase.CLOSED)
 
 
@@ -75,7 +86,7 @@ class _Vehicle:
     flight: ConductedFlight
     asked: set[Phase] = field(default_factory=set)
     cleared: dict[Phase, float] = field(default_factory=dict)
-    heard: float = -math.inf  # s, when its pilot was heard last
+    heard: float = -math.inf  # s, when its pilot's tick loop was heard last
     poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
     stood: Triple | None = None  # m, when it passed preflight
     descending: bool = False
@@ -141,7 +152,8 @@ class Conductor:
     def hear(self, name: str, message: PilotMessage | FlightEnded | Telemetry, now: float) -> None:
         """Take what a vehicle's pilot says at a time, s."""
         vehicle = self._vehicles[name]
-        vehicle.heard = now
+        if not isinstance(message, _OF_THE_RADIO):
+            vehicle.heard = now
         match message:
             case PoseReceived():
                 vehicle.poses.append(message)
@@ -150,6 +162,8 @@ class Conductor:
                 vehicle.down |= phase in _DOWN
             case ClearanceAsked(phase=phase):
                 vehicle.asked.add(phase)
+            case Event(level=Level.ERROR, text=text) if Phase.TAKE_OFF in vehicle.cleared:  # as when the link is lost
+                self._brake(f"{name}: {text}")
             case PlanLeft(reason=reason):
                 vehicle.left = True
                 self._brake(f"{name}: {reason}")
