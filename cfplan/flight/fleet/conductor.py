@@ -42,8 +42,9 @@ from cfplan.flight.telemetry import (
 STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
-START_LEAD = 0.5  # s from the last vehicle's readiness to the start of all, for the message to arrive
+START_LEAD = 0.7  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
+START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
@@ -157,7 +158,9 @@ class Conductor:
         match message:
             case PoseReceived():
                 vehicle.poses.append(message)
-            case PhaseEntered(phase=phase):
+            case PhaseEntered(time=began, phase=phase):
+                if phase is Phase.STREAM and (late := began - vehicle.cleared.get(phase, -math.inf)) > START_LATE:
+                    self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE:g} s")
                 vehicle.descending |= phase in _DESCENDING
                 vehicle.down |= phase in _DOWN
             case ClearanceAsked(phase=phase):

@@ -5,7 +5,15 @@ import math
 import pytest
 
 from cfplan.errors import ExitCode
-from cfplan.flight.fleet.conductor import PILOT_SILENT, START_LEAD, ConductedFlight, Conductor, FlightEnded, Stage
+from cfplan.flight.fleet.conductor import (
+    PILOT_SILENT,
+    START_LATE,
+    START_LEAD,
+    ConductedFlight,
+    Conductor,
+    FlightEnded,
+    Stage,
+)
 from cfplan.flight.pilot.conducted import CONDUCTOR_SILENT, ClearanceAsked, ConductorMessage, HeldConductor, PlanLeft
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Estimate, Event, Level, Phase, PhaseEntered, PoseReceived, VehicleStatus
@@ -116,6 +124,24 @@ def test_all_begin_at_one_time_each_after_its_delay():
     assert fleet.go_on(1.0)["left"].cleared[Phase.STREAM] == begins
     assert fleet.conductor.stage is Stage.FLYING
     assert not braking(said)
+
+
+@pytest.mark.parametrize(("late", "brakes"), [(START_LATE - 0.001, False), (START_LATE + 0.001, True)])
+def test_all_brake_when_one_begins_late(late, brakes):
+    fleet = Fleet(delay=0.7)
+    begins = fleet.fly()["right"].cleared[Phase.STREAM]
+    fleet.go_on(1.3)
+    fleet.hear("right", PhaseEntered(begins + late, Phase.STREAM))
+    assert bool(braking(fleet.go_on(0.01))) is brakes
+
+
+def test_a_pilot_that_hears_of_its_start_too_late_has_braked_before():
+    fleet = Fleet()
+    before = fleet.fly()["left"]
+    now = fleet.now
+    held = HeldConductor(lambda _: None, lambda: now)
+    held.give(ConductorMessage({phase: time for phase, time in before.cleared.items() if phase is not Phase.STREAM}))
+    assert held.brakes(before.cleared[Phase.STREAM])
 
 
 def test_bodies_that_are_swapped_on_the_floor_are_named_and_nothing_is_armed():
