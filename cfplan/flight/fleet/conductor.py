@@ -42,7 +42,7 @@ from cfplan.flight.telemetry import (
 STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
-START_LEAD = 0.7  # s from the last vehicle's readiness to the start of all, for the message to arrive
+START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
