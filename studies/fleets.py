@@ -217,8 +217,8 @@ def _nearest_lost(members: Sequence[FleetMember], limits: Limits, moments: int, 
             for j, other in enumerate(members):
                 if j != i:
                     begins = float(random.uniform(*NOTICED))
-                    braking = _braking(other, encoded[j], lost.delay + own, begins)
-                    least = min(least, _least(way, braking))
+                    for loss in (lost.delay + own,) if own else (-begins - 1.0, lost.delay):  # also before the start
+                        least = min(least, _least(way, _braking(other, encoded[j], loss, begins)))
     return float(least)
 
 
@@ -226,6 +226,8 @@ def _braking(member: FleetMember, encoded: EncodedFlight, loss: float, begins: f
     """Return the places, (M, 2) m at each setpoint after a loss, of a vehicle that begins to brake then."""
     motion = encoded.motion
     own = np.round((loss - member.delay) * RATE) + np.arange(round(begins * RATE) + 1)
+    if own[-1] < 0:  # it waits at its start
+        return motion.position[:1, :2]
     rows = np.clip(own, 0, len(motion.position) - 1).astype(int)
     stop, _ = stop_motion(motion, rows[-1:], RATE)
     return np.concatenate([motion.position[rows[:-1]], stop.position])[:, :2]
