@@ -6,7 +6,7 @@ from urllib.parse import quote
 
 from cfplan.errors import InputError
 from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
-from cfplan.flight.radio.uri import check_vehicle_uri, same_vehicle
+from cfplan.flight.radio.uri import check_vehicle_uri
 from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.preparation.steps import OnStep
 from cfplan.safety.limits import PoseLimits
@@ -101,7 +101,7 @@ def _require_different(what: str, names: Mapping[str, str], fleet: FleetFile) ->
     found: list[tuple[str, str]] = []
     for name, value in names.items():
         for other, before in found:
-            if value == before or (what == "address" and same_vehicle(value, before)):
+            if value == before or (what == "address" and _same_vehicle(value, before)):
                 raise InputError(
                     f"{other} and {name} have the same {what}, {value!r}", where=fleet.name, hint="give each its own"
                 )
@@ -114,3 +114,19 @@ def _body_uri(mocap: str | None, body: str) -> str:
     uri = f"{str(parse_uri(mocap, subject_needed=False)).rstrip('/')}/{quote(body, safe='')}"
     parse_uri(uri, subject_needed=True)
     return uri
+
+
+def _same_vehicle(a: str, b: str) -> bool:
+    """Return whether two valid URIs lead to one vehicle: by radio the dongle does not matter, but the rest does."""
+    return _vehicle(a) == _vehicle(b)
+
+
+def _vehicle(uri: str) -> tuple[str, ...]:
+    """Return what identifies a vehicle, with cflib's defaults for what a URI leaves out."""
+    kind, _, rest = uri.partition("?")[0].partition("://")
+    if kind == "sim":
+        return kind, str(int(rest))
+    if kind != "radio":
+        return kind, rest
+    _, channel, rate, address, *_ = [*rest.split("/"), "", "", ""]
+    return kind, str(int(channel)), rate or "2M", address.upper() or "E7E7E7E7E7"

@@ -1,7 +1,8 @@
 """The sources that a study's figures depend on, and their digest: a result of other sources is out of date.
 
 The sources are the study's module, all modules of cfplan and studies that it imports, directly or not, and the shipped
-models and limits. Comments, docstrings, layout and lists of what a room offers do not count.
+models and limits. Comments, docstrings, layout, imports for type checkers alone, and a package's `__init__.py`, which
+only lists what the package offers, do not count; nor does this module.
 """
 
 import ast
@@ -20,7 +21,7 @@ PACKAGES = ("cfplan", "studies")
 def sources_digest(module: str) -> str:
     """Return the digest of everything that a study's figures depend on; `module` is a name such as studies.flights."""
     digest = hashlib.sha256()
-    for file in sorted(_closure(module)):
+    for file in sorted(each for each in _closure(module) if each.name != "__init__.py" and each != Path(__file__)):
         digest.update(f"{file.relative_to(REPOSITORY)}\n{_code_digest(file)}\n".encode())
     for top in DATA:
         found = [REPOSITORY / top] if (REPOSITORY / top).is_file() else sorted((REPOSITORY / top).rglob("*"))
@@ -61,7 +62,14 @@ def _file_of(module: str) -> Path | None:
 
 @cache
 def _tree(file: Path) -> ast.Module:
-    return ast.parse(file.read_text(encoding="utf-8"))
+    return _WithoutTypeChecking().visit(ast.parse(file.read_text(encoding="utf-8")))
+
+
+class _WithoutTypeChecking(ast.NodeTransformer):
+    """Removes `if TYPE_CHECKING:` with its body, which never runs."""
+
+    def visit_If(self, node: ast.If) -> ast.AST | None:
+        return None if ast.unparse(node.test) == "TYPE_CHECKING" else self.generic_visit(node)
 
 
 @cache

@@ -13,7 +13,7 @@ Each vehicle has its own pilot, which may end its flight at any time. The conduc
                   answer, or is nearer to another than the fleet's certificate allows
 
 It is a pure core: a driver tells it what it hears, and passes on what it says. Its silence is an order too: a pilot
-that has not heard it for a second brakes.
+that has not heard it for `CONDUCTOR_SILENT` brakes.
 """
 
 import itertools
@@ -27,16 +27,29 @@ import numpy as np
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.conducted import ClearanceAsked, ConductorMessage, PilotMessage, PlanLeft
-from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, Telemetry, Triple
+from cfplan.flight.telemetry import (
+    Estimate,
+    Event,
+    Level,
+    Phase,
+    PhaseEntered,
+    PoseReceived,
+    Telemetry,
+    Triple,
+    VehicleStatus,
+)
 
 STANDS_WITHIN = 0.05  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
 STANDS_NEARER = 0.02  # m by which two may stand nearer than they keep apart in the air: errors of the poses
-PILOT_SILENT = 0.5  # s without a message of a pilot whose vehicle has passed preflight
-START_LEAD = 0.5  # s from the last vehicle's readiness to the start of all, for the message to arrive
+PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
+START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
+"""Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
+START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
+_OF_THE_RADIO = (Estimate, VehicleStatus, Event)  # may come from another thread of the pilot, whose tick loop hangs
 _DESCENDING, _DOWN = (Phase.LAND, Phase.DISARM, Phase.CLOSED), (Phase.DISARM, Phase.CLOSED)
 
 
@@ -75,7 +88,7 @@ class _Vehicle:
     flight: ConductedFlight
     asked: set[Phase] = field(default_factory=set)
     cleared: dict[Phase, float] = field(default_factory=dict)
-    heard: float = -math.inf  # s, when its pilot was heard last
+    heard: float = -math.inf  # s, when its pilot's tick loop was heard last
     poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
     stood: Triple | None = None  # m, when it passed preflight
     descending: bool = False
@@ -141,15 +154,20 @@ class Conductor:
     def hear(self, name: str, message: PilotMessage | FlightEnded | Telemetry, now: float) -> None:
         """Take what a vehicle's pilot says at a time, s."""
         vehicle = self._vehicles[name]
-        vehicle.heard = now
+        if not isinstance(message, _OF_THE_RADIO):
+            vehicle.heard = now
         match message:
             case PoseReceived():
                 vehicle.poses.append(message)
-            case PhaseEntered(phase=phase):
+            case PhaseEntered(time=began, phase=phase):
+                if phase is Phase.STREAM and (late := began - vehicle.cleared.get(phase, -math.inf)) > START_LATE:
+                    self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE:g} s")
                 vehicle.descending |= phase in _DESCENDING
                 vehicle.down |= phase in _DOWN
             case ClearanceAsked(phase=phase):
                 vehicle.asked.add(phase)
+            case Event(level=Level.ERROR, text=text) if Phase.TAKE_OFF in vehicle.cleared:  # as when the link is lost
+                self._brake(f"{name}: {text}")
             case PlanLeft(reason=reason):
                 vehicle.left = True
                 self._brake(f"{name}: {reason}")

@@ -1,19 +1,23 @@
 """Fly a fleet in real time: one process a pilot, and the conductor in the main process.
 
-The main process passes everything that pilots say to the conductor and to listeners, and the conductor's messages and
-the operator's orders to the pilots. If it dies, each pilot notices and lands.
+The main process passes everything that pilots say to the conductor and to a listener, and the conductor's messages and
+the operator's orders to the pilots. The listener has its own thread, so the conductor never waits for what is printed
+or written. If the main process dies or this loop fails, all pilots notice at once and land.
 """
 
 import contextlib
+import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
+from queue import SimpleQueue
 
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.fleet.conductor import ConductedFlight, Conductor, FlightEnded, Stage
 from cfplan.flight.mocap.poses import PoseSource
-from cfplan.flight.pilot.conducted import ConductorMessage
+from cfplan.flight.pilot.conducted import ConductorMessage, PilotMessage
 from cfplan.flight.pilot.keys import Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
@@ -21,7 +25,7 @@ from cfplan.flight.pilot.process import PilotProcess, pilot_died
 from cfplan.flight.telemetry import Telemetry
 
 _PERIOD = 0.005  # s between looks of the conductor, if nothing comes meanwhile
-_BEAT = 0.1  # s between messages of the conductor that say nothing new; pilots brake after 1 s without any
+_BEAT = 0.05  # s between messages of the conductor that say nothing new; pilots brake after CONDUCTOR_SILENT without
 
 Listen = Callable[[str, Telemetry], None]
 
@@ -69,17 +73,22 @@ def fly_together(
 ) -> FleetOutcome:
     """Fly missions as their conductor allows, and return when all vehicles are down.
 
-    `listen` gets every message of every pilot, in order; what it raises is raised here after all have landed. The
-    keyboard is one that was entered in the main thread, so that Ctrl-C lands all. `more_orders` returns the orders
-    since its last call that came neither by key nor by signal.
+    `listen` gets every message of every pilot, in order, in another thread. The keyboard is one that was entered in the
+    main thread, so that Ctrl-C lands all. `more_orders` returns the orders since its last call that came neither by key
+    nor by signal. If one of these three raises, all land, and the first exception is raised here afterwards.
     """
     fleet = _Fleet(pilots, conductor, listen)
-    with contextlib.ExitStack() as processes:
+    with contextlib.ExitStack() as flight:
+        flight.enter_context(fleet.listening())
         for pilot in pilots:
-            processes.enter_context(pilot.process)
+            flight.enter_context(pilot.process)
+        flight.callback(fleet.release)  # runs first: all pilots notice before any of them is waited for
+        for pilot in pilots:
             pilot.process.assign(pilot.mission, pilot.uri, pilot.pose_source, conducted=True)
         while conductor.stage is not Stage.ENDED:
-            fleet.pass_on([*keyboard.orders(), *more_orders()])
+            fleet.take_orders(keyboard.orders)
+            fleet.take_orders(more_orders)
+            fleet.pass_on()
     if fleet.failure is not None:
         raise fleet.failure
     return FleetOutcome(fleet.outcomes, fleet.ends, conductor.brakes, conductor.begins, conductor.nearest)
@@ -94,12 +103,52 @@ class _Fleet:
         self._said: dict[str, tuple[ConductorMessage, float]] = {}  # what each was told last, and when, s
         self.outcomes: dict[str, FlightOutcome] = {}
         self.ends: dict[str, FlightEnded] = {}
-        self.failure: BaseException | None = None  # of the listener
+        self._orders: deque[Order] = deque()  # that no pilot has yet
+        self._news: SimpleQueue[tuple[str, Telemetry] | None] = SimpleQueue()  # for the listener; None ends it
+        self.failure: BaseException | None = None  # the first one of the listener or a source of orders
 
-    def pass_on(self, orders: Iterable[Order]) -> None:
+    @contextlib.contextmanager
+    def listening(self) -> Iterator[None]:
+        """Let the listener hear of all news in its thread; at the end, wait until it has."""
+        thread = threading.Thread(target=self._tell_listener, name="listener")
+        thread.start()
+        try:
+            yield
+        finally:
+            self._news.put(None)
+            thread.join()
+
+    def _tell_listener(self) -> None:
+        while (news := self._news.get()) is not None:
+            if self.failure is None:
+                try:
+                    self._listen(*news)
+                except BaseException as error:  # a fault here must not break the flight
+                    self._fail(error)
+
+    def take_orders(self, source: Callable[[], Iterable[Order]]) -> None:
+        """Take the orders that a source returns."""
+        try:
+            self._orders.extend(source())
+        except BaseException as error:  # the other source still counts
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        if self.failure is None:
+            self.failure = error
+            self._orders.append(Order.LAND)
+
+    def release(self) -> None:
+        """Let all pilots notice that they are alone; those that still fly land."""
+        for pilot in self._pilots.values():
+            pilot.process.orders.close()
+
+    def pass_on(self) -> None:
         """Pass on orders, and what has come from pilots, at most after a moment."""
-        for order in orders:
-            self._order(order)
+        while self._orders:
+            order = self._orders.popleft()
+            for name in self._pilots:
+                self._send(name, order)
         ready = set(wait([connection for _, connection in self._connections()], _PERIOD))
         for name, connection in self._connections():
             if connection in ready and name not in self.ends:
@@ -120,39 +169,34 @@ class _Fleet:
             message = connection.recv()
         except (EOFError, OSError):
             if connection is process.telemetry:  # that of orders closes first when it ends
-                died = pilot_died(process.process)
+                self._tell_conductor(name, FlightEnded(ExitCode.LINK_LOST, "its pilot's process died"))
+                died = pilot_died(process.process)  # waits for the exit code
                 self._end(name, FlightEnded(died.exit_code, str(died)))
             else:
                 wait([process.telemetry], _PERIOD)
             return
         if connection is process.orders:
-            self._conductor.hear(name, message, REAL_CLOCK.now())
+            self._tell_conductor(name, message)
         elif isinstance(message, list):
-            self._hear(name, message)
+            now = REAL_CLOCK.now()
+            for each in message:
+                self._conductor.hear(name, each, now)
+                self._news.put((name, each))
         elif isinstance(message, FlightOutcome):
             self.outcomes[name] = message
             self._end(name, FlightEnded(message.exit_code, message.reason))
         elif isinstance(message, CfplanError):
             self._end(name, FlightEnded(message.exit_code, str(message)))
 
-    def _hear(self, name: str, messages: list[Telemetry]) -> None:
-        now = REAL_CLOCK.now()
-        for message in messages:
-            self._conductor.hear(name, message, now)
-            if self.failure is None:
-                try:
-                    self._listen(name, message)
-                except BaseException as error:  # a fault here must not break the flight
-                    self.failure = error
-                    self._order(Order.LAND)
-
     def _end(self, name: str, end: FlightEnded) -> None:
         self.ends[name] = end
-        self._conductor.hear(name, end, REAL_CLOCK.now())
+        self._tell_conductor(name, end)
 
-    def _order(self, order: Order) -> None:
-        for name in self._pilots:
-            self._send(name, order)
+    def _tell_conductor(self, name: str, message: PilotMessage | FlightEnded) -> None:
+        """Pass on a message that may let all brake, and the orders that follow from it."""
+        now = REAL_CLOCK.now()
+        self._conductor.hear(name, message, now)
+        self._conduct(now)
 
     def _conduct(self, now: float) -> None:
         """Tell each pilot what is new, or that the conductor is alive."""

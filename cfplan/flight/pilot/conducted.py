@@ -14,7 +14,7 @@ from cfplan.flight.pilot.abort_reasons import Abort
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
 
-CONDUCTOR_SILENT = 1.0  # s without a message of the conductor, which sends ten a second
+CONDUCTOR_SILENT = 1.0  # s without a message of the conductor, which sends twenty a second
 
 
 @dataclass(frozen=True, slots=True)

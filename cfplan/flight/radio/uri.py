@@ -29,22 +29,6 @@ def check_vehicle_uri(uri: str) -> None:
         raise InputError("not the URI of a vehicle", where=uri, hint=f"a URI looks like {EXAMPLES}")
 
 
-def same_vehicle(a: str, b: str) -> bool:
-    """Return whether two valid URIs lead to one vehicle: by radio the dongle does not matter, but the rest does."""
-    return _vehicle(a) == _vehicle(b)
-
-
-def _vehicle(uri: str) -> tuple[str, ...]:
-    """Return what identifies a vehicle, with cflib's defaults for what a URI leaves out."""
-    kind, _, rest = uri.partition("?")[0].partition("://")
-    if kind == "sim":
-        return kind, str(int(rest))
-    if kind != "radio":
-        return kind, rest
-    _, channel, rate, address, *_ = [*rest.split("/"), "", "", ""]
-    return kind, str(int(channel)), rate or "2M", address.upper() or "E7E7E7E7E7"
-
-
 def _check_radio(uri: str) -> None:
     """Check a radio's URI: cflib takes an unknown rate for 2M, and fills a short address with zeros."""
     radio, _, rest = uri.removeprefix("radio://").partition("/")

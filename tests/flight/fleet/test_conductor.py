@@ -5,10 +5,18 @@ import math
 import pytest
 
 from cfplan.errors import ExitCode
-from cfplan.flight.fleet.conductor import PILOT_SILENT, START_LEAD, ConductedFlight, Conductor, FlightEnded, Stage
+from cfplan.flight.fleet.conductor import (
+    PILOT_SILENT,
+    START_LATE,
+    START_LEAD,
+    ConductedFlight,
+    Conductor,
+    FlightEnded,
+    Stage,
+)
 from cfplan.flight.pilot.conducted import CONDUCTOR_SILENT, ClearanceAsked, ConductorMessage, HeldConductor, PlanLeft
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived
+from cfplan.flight.telemetry import Estimate, Event, Level, Phase, PhaseEntered, PoseReceived, VehicleStatus
 
 APART = 0.3
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -128,6 +136,24 @@ def test_all_begin_at_one_time_each_after_its_delay():
     assert not braking(said)
 
 
+@pytest.mark.parametrize(("late", "brakes"), [(START_LATE - 0.001, False), (START_LATE + 0.001, True)])
+def test_all_brake_when_one_begins_late(late, brakes):
+    fleet = Fleet(delay=0.7)
+    begins = fleet.fly()["right"].cleared[Phase.STREAM]
+    fleet.go_on(1.3)
+    fleet.hear("right", PhaseEntered(begins + late, Phase.STREAM))
+    assert bool(braking(fleet.go_on(0.01))) is brakes
+
+
+def test_a_pilot_that_hears_of_its_start_too_late_has_braked_before():
+    fleet = Fleet()
+    before = fleet.fly()["left"]
+    now = fleet.now
+    held = HeldConductor(lambda _: None, lambda: now)
+    held.give(ConductorMessage({phase: time for phase, time in before.cleared.items() if phase is not Phase.STREAM}))
+    assert held.brakes(before.cleared[Phase.STREAM])
+
+
 def test_bodies_that_are_swapped_on_the_floor_are_named_and_nothing_is_armed():
     fleet = Fleet()
     fleet.places = {"left": fleet.places["right"], "right": fleet.places["left"]}
@@ -185,6 +211,27 @@ def test_all_brake_when_a_pilot_is_silent():
     assert not braking(fleet.go_on(PILOT_SILENT - 0.05))
     assert braking(fleet.go_on(0.1)) == {"left", "right"}
     assert "right" in fleet.conductor.brakes
+
+
+def test_all_brake_when_a_tick_loop_hangs_while_the_radio_of_that_pilot_goes_on():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.silent.add("right")
+    still = (0.0, 0.0, 0.0)
+    for _ in range(round(100 * PILOT_SILENT) + 5):
+        fleet.hear("right", Estimate(fleet.now, still, still, still, LEVEL))
+        fleet.hear("right", VehicleStatus(fleet.now, still, (0, 0, 0, 0), 4.0, 0))
+        fleet.hear("right", Event(fleet.now, Level.WARNING, "radio: busy"))
+        said = fleet.go_on(0.01)
+    assert braking(said) == {"left", "right"}
+    assert "right: its pilot has been silent" in said["left"].brakes
+
+
+def test_all_brake_as_soon_as_a_pilot_reports_that_its_link_is_lost():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.hear("right", Event(fleet.now, Level.ERROR, "the link was lost: the radio is gone"))
+    assert "right: the link was lost" in fleet.go_on(0.01)["left"].brakes
 
 
 @pytest.mark.parametrize(("distance", "brakes"), [(0.21, False), (0.19, True)])

@@ -125,6 +125,15 @@ def test_pilots_whose_conductor_dies_brake_and_land():
     assert_down(flight)
 
 
+def test_a_pilot_that_stalls_before_its_start_lets_all_brake():
+    fleet = fleet_of(delays={"left": 0.0, "right": 0.25})
+    stalled = fleet.labs["right"].clock
+    flight = fleet.fly(streaming(fleet, "left", 0.1, lambda: stalled.stall(0.24)))
+    assert flight.brakes.startswith("right: it began")
+    assert_down(flight)
+    assert max(flight.truths["left"].position[:, 0]) < 0.5
+
+
 def kill_pilot(fleet):
     fleet.labs["left"].kill_pilot()
 
