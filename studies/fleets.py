@@ -2,7 +2,8 @@
 
 Each fleet flies random min-snap paths, which are planned alone before. A fleet of fewer vehicles has the first paths of
 the largest one of the same seed. The checks share no code with the certificates: they compare the states of the plans
-over the skew, and fly drawn vehicles without link and poses beside the others, which brake.
+over the skew, and the stops from every setpoint when all brake, and fly drawn vehicles without link and poses beside
+the others, which brake.
 """
 
 import itertools
@@ -65,7 +66,7 @@ class CoordinatedFleet:
     vehicles: int
     makespan: float  # of the slowest vehicle alone, without regard to lost vehicles
     seconds: float  # of processor time: coordination and certificate
-    nearest: float  # m, of a pair, by the check
+    nearest: float  # m, of a pair, on their paths and when all brake, by the check
     exposed: float  # fraction of the time for which a vehicle must not be lost, mean of the vehicles
     lost_makespan: float
     lost_seconds: float
@@ -90,7 +91,7 @@ COLUMNS = (
            value=among("solved", mean("makespan"))),
     Column("seconds", "median", "s", ".1f", meaning="processor time, without that of the plans alone",
            value=quantile("seconds", 0.5)),
-    Column("nearest", "nearest", "m", ".3f", meaning="of all pairs, by the dense check over the skew",
+    Column("nearest", "nearest", "m", ".3f", meaning="of all pairs, also when all brake, by the dense check",
            value=among("solved", smallest("nearest"))),
     Column("exposed", "exposed", "%", ".0f", meaning="mean; fraction of the time at which a lost vehicle may come too "
            "near to another", value=among("solved", mean("exposed"))),
@@ -147,7 +148,7 @@ def _coordinated(seed: int, alone: Sequence[FleetMember], limits: Limits, moment
         separations(apart, SKEW)
         seconds += time.process_time() - begun
         makespan = max(each.end for each in apart) / longest
-        nearest = min(_apart(a, b) for a, b in itertools.combinations(apart, 2))
+        nearest = _nearest_pair(apart, limits)
         exposed = float(np.mean([each.exposed for each in model.losses(apart, numbers, SKEW)]))
 
     begun = time.process_time()
@@ -173,6 +174,28 @@ def _apart(a: FleetMember, b: FleetMember) -> float:
     return min(float(np.linalg.norm(of_a - _positions(b, times + late), axis=1).min()) for late in skews)
 
 
+def _nearest_pair(members: Sequence[FleetMember], limits: Limits) -> float:
+    """Return the least distance of two vehicles on their paths, and when all brake at one moment, m."""
+    least = min(_apart(a, b) for a, b in itertools.combinations(members, 2))
+    ticks = np.arange(round((max(member.end for member in members) + 0.1) * RATE))
+    stops = [_stops(member, ticks, limits) for member in members]
+    for a, b in itertools.combinations(stops, 2):
+        for late in range(round(SKEW * RATE) + 1):
+            early = len(ticks) - late
+            for one, other in ((a[:early], b[late:]), (b[:early], a[late:])):
+                least = min(least, float(np.linalg.norm(one - other, axis=2).min()))
+    return least
+
+
+def _stops(member: FleetMember, ticks: NDArray, limits: Limits) -> NDArray:
+    """Return the places of stops that begin at ticks of the common clock, (N, M, 2) m; before its start it waits."""
+    motion = encode_flight(PlannedFlight(member.name, member.plan, limits)).motion
+    rows = ticks - round(member.delay * RATE)
+    stops, _ = stop_motion(motion, np.clip(rows, 0, len(motion.position) - 1), RATE)
+    places = stops.position.reshape(len(ticks), -1, 3)[..., :2]
+    return np.where((rows < 0)[:, None, None], motion.position[0, :2], places)
+
+
 def _positions(member: FleetMember, times: NDArray) -> NDArray:
     trajectory = member.plan.trajectory
     return np.asarray(trajectory.at(np.clip(times - member.delay, 0.0, trajectory.duration)).position[:, :2])
@@ -194,8 +217,8 @@ def _nearest_lost(members: Sequence[FleetMember], limits: Limits, moments: int, 
             for j, other in enumerate(members):
                 if j != i:
                     begins = float(random.uniform(*NOTICED))
-                    braking = _braking(other, encoded[j], lost.delay + own, begins)
-                    least = min(least, _least(way, braking))
+                    for loss in (lost.delay + own,) if own else (-begins - 1.0, lost.delay):  # also before the start
+                        least = min(least, _least(way, _braking(other, encoded[j], loss, begins)))
     return float(least)
 
 
@@ -203,6 +226,8 @@ def _braking(member: FleetMember, encoded: EncodedFlight, loss: float, begins: f
     """Return the places, (M, 2) m at each setpoint after a loss, of a vehicle that begins to brake then."""
     motion = encoded.motion
     own = np.round((loss - member.delay) * RATE) + np.arange(round(begins * RATE) + 1)
+    if own[-1] < 0:  # it waits at its start
+        return motion.position[:1, :2]
     rows = np.clip(own, 0, len(motion.position) - 1).astype(int)
     stop, _ = stop_motion(motion, rows[-1:], RATE)
     return np.concatenate([motion.position[rows[:-1]], stop.position])[:, :2]

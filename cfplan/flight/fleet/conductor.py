@@ -39,8 +39,9 @@ from cfplan.flight.telemetry import (
     VehicleStatus,
 )
 
-STANDS_WITHIN = 0.10  # m beside the column of its start that a vehicle may stand
+STANDS_WITHIN = 0.05  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
+STANDS_NEARER = 0.02  # m by which two may stand nearer than they keep apart in the air: errors of the poses
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
@@ -251,8 +252,9 @@ class Conductor:
             assert a.stood is not None
             assert b.stood is not None
             distance = math.dist(a.stood[:2], b.stood[:2])
-            if not distance >= self._apart - 2.0 * TRACKING:
-                self._brake(f"{a.name} and {b.name} stand {distance:.2f} m apart, which must be {self._apart:g} m")
+            allowed = self._apart - STANDS_NEARER
+            if not distance >= allowed:
+                self._brake(f"{a.name} and {b.name} stand {distance:.2f} m apart, which must be {allowed:.2f} m")
 
     def _require_not_swapped(self, vehicle: _Vehicle, stood: Triple, vehicles: Sequence[_Vehicle]) -> None:
         """End the flight on the floor if a vehicle stands under the start of another."""

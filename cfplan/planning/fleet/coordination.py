@@ -20,7 +20,7 @@ from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_
 from cfplan.planning.fleet.hazards import Hazards
 from cfplan.planning.fleet.lost import Loss, LossModel
 from cfplan.planning.fleet.members import FleetMember, places
-from cfplan.planning.fleet.separation import Separation, separations
+from cfplan.planning.fleet.separation import STOP, Separation, separations
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.repair import under_caps
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
@@ -208,19 +208,22 @@ class _Search:
         """Return the fastest clock of a vehicle among the tracks of others."""
         trajectory = self.members[number].plan.trajectory
         own = places(trajectory, cells_of(trajectory.duration))
-        ticks = TICK * np.arange(
-            int(np.ceil((max((track.end for track in tracks), default=0.0) + self.skew) / TICK)) + 2
-        )
+        goes_on = STOP + self.skew  # while all brake
+        last = max((max(track.end, track.delay + goes_on) for track in tracks), default=0.0) + self.skew
+        ticks = TICK * np.arange(int(np.ceil(last / TICK)) + 2)
         band = np.linspace(-self.skew, self.skew, 2 * int(np.ceil(self.skew / _BETWEEN_SKEWS)) + 1)
-        others = np.zeros((len(tracks), len(ticks), len(band), 2))
+        others = np.zeros((len(tracks), len(ticks), len(band) + 1, 2))
         for row, track in zip(others, tracks, strict=True):
-            row[:] = track.columns(ticks[:, None] + band)
-        hazard, may_start = np.zeros((len(ticks), len(own)), dtype=np.bool_), np.ones(len(ticks), dtype=np.bool_)
+            row[:, :-1] = track.columns(ticks[:, None] + band)
+            # It stays at its start if all brake before it begins.
+            row[:, -1] = track.columns(np.where(ticks <= track.delay + goes_on + TICK, 0.0, ticks))
+        keeps = min(self.apart + slack, max(self.at_rest, self.apart))
+        hazard = np.zeros((len(ticks), len(own)), dtype=np.bool_)
+        may_start = _may_start(own[0], others, keeps, int(np.ceil(goes_on / TICK)))
         if self.hazards is not None:
             for track in tracks:
                 times = np.where(ticks < track.delay, ticks - track.delay, track.own(ticks))
                 self.hazards.mark(hazard, may_start, (number, track.number), times, slack)
-        keeps = min(self.apart + slack, max(self.at_rest, self.apart))
         clock = fastest_clock(own, others, keeps, hazard, may_start)
         return clock if isinstance(clock, VehicleClock) else self._blocked(number, clock, tracks)
 
@@ -238,6 +241,16 @@ class _Search:
         then = np.array([stuck.time])
         nearest = min(tracks, key=lambda track: float(np.linalg.norm(track.columns(then)[0] - ahead)))
         return Blocked((self.members[number].name, self.members[nearest.number].name), (x, y), stuck.time)
+
+
+def _may_start(start: NDArray, others: NDArray, keeps: float, goes_on: int) -> NDArray:
+    """Return whether a vehicle may start at each tick, (T,) bool: no other comes near its start within some ticks.
+
+    If all brake before it starts, it stays there, while the others, (K, T, W, 2) m, go on for `goes_on` ticks.
+    """
+    near = ~(np.linalg.norm(others - start, axis=-1) >= keeps).all(axis=(0, 2))
+    then = np.minimum(np.arange(len(near))[:, None] + np.arange(goes_on + 1), len(near) - 1)
+    return np.asarray(~near[then].any(axis=1))
 
 
 def _distance_at_rest(members: Sequence[FleetMember]) -> float:

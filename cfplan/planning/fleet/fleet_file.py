@@ -17,16 +17,24 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from cfplan.errors import InputError
-from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
+from cfplan.files.yaml_with_places import HINT, Places, read_plain, read_yaml_with_places
 from cfplan.geometry.path_file import PathFile, PathPlace, load_path_file
 from cfplan.planning.fleet.address_file import read_address_file
 
 FEWEST, MOST = 2, 6  # vehicles
 APART = 0.30  # m: downwash is below 5 % of weight at 0.20 m, and each vehicle may be 0.05 m off its path
-SKEW = 0.03  # s
+SKEW = 0.03  # s: three ticks of the clock of a pilot
+_LEAST = {  # least value, unit and hint
+    "apart": (
+        APART,
+        "m",
+        "vehicles are up to 0.05 m off their paths and touch at 0.14 m; leave it out for the default",
+    ),
+    "skew": (SKEW, "s", "pilots begin and obey within some ticks of 0.01 s; leave it out for the default"),
+}
 _KEY = "vehicles"
 
 
@@ -71,11 +79,19 @@ class _Content(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str = Field(default="", max_length=100, pattern=r"^[^\n\r]*$")
-    apart: float = Field(default=APART, ge=0.2, le=5.0)
-    skew: float = Field(default=SKEW, ge=0.0, le=0.2)
+    apart: float = Field(default=APART, le=5.0)
+    skew: float = Field(default=SKEW, le=0.2)
     lost: Literal["refuse", "warn"] = "refuse"
     addresses: str = ""  # name of a file with the addresses of vehicles without `uri`
     vehicles: dict[str, _Vehicle]
+
+    @field_validator("apart", "skew")
+    @classmethod
+    def _wide_enough(cls, value: float, info: ValidationInfo) -> float:
+        least, unit, why = _LEAST[info.field_name or ""]
+        if not value >= least:
+            raise ValueError(f"must be at least {least:g} {unit}, not {value:g}{HINT}{why}")
+        return value
 
 
 def is_fleet_file(file: pathlib.Path) -> bool:

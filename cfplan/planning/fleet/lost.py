@@ -8,6 +8,9 @@ compared with each other too.
 While a lost vehicle is in the air, the others keep away from its tube at all heights. Once it lies, they may pass over
 it, but none may stop or end above it.
 
+A vehicle that waits at its start when it is told to brake stays there. At the fleet's start all wait, or may do so by
+the skew, so the first moment also covers the time before it, when all hover at their starts.
+
 A vehicle that is lost while it brakes for another reason is not part of this certificate.
 """
 
@@ -78,6 +81,7 @@ class _Ways(NamedTuple):
     first: NDArray  # (S,) int, samples from the place at the loss
     last: NDArray  # (S,) int
     rest: NDArray  # (2,) int, first and last where it rests
+    waits: int  # samples; from a place before this one it may brake before it begins, and stays at its start
     far: float  # m, the largest distance that matters
 
 
@@ -164,6 +168,7 @@ def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
         np.floor(first / _SAMPLE).astype(np.int64),
         np.ceil(last / _SAMPLE).astype(np.int64),
         np.array([np.floor(rests[0] / _SAMPLE), np.ceil(rests[1] / _SAMPLE)]).astype(np.int64),
+        int(np.ceil((skew - soonest) / _SAMPLE)),
         far,
     )
 
@@ -187,6 +192,8 @@ def _least(boxes: NDArray, rows: NDArray, samples: NDArray, per_sample: float, b
                 first, last = ways.first[part], ways.last[part]
                 if lies:
                     first, last = ways.rest[0], ways.rest[1]
+                if begin[n] <= ways.waits:
+                    first = -begin[n]
                 first = min(max(begin[n] + first, 0), len(samples) - 1)
                 last = min(max(begin[n] + last, 0), len(samples) - 1)
                 out[n] = _nearest_sample(box, samples, per_sample, first, last, out[n])

@@ -7,9 +7,10 @@ standing are all in the columns of start and end, so the distance between column
 The clocks of two vehicles differ by at most the skew, so each moment of one is compared with all moments of the other
 within the skew. The distance that a vehicle may move between samples, at its certified speed, is subtracted.
 
-Joint stops need no samples of their own: each stop slows the clock along the path by the same law, so vehicles that
-brake at the same tick pass through pairs of positions that are compared here, and rest at such a pair. The order to
-brake may reach them at different times, which adds to the skew.
+Each stop slows the clock along the path by the same law, so vehicles that brake at the same tick pass through pairs of
+positions that are compared here, and rest at such a pair. The order to brake may reach them at different times, which
+adds to the skew. A vehicle that has not begun yet stays at its start when all brake, while the others go on along their
+paths. So each start is also compared with the places of the others until STOP after the vehicle there would have begun.
 
 A vehicle without poses or without its link leaves its path, which this certificate does not cover.
 """
@@ -26,6 +27,9 @@ from cfplan.planning.fleet.members import FleetMember
 from cfplan.safety.space import inside
 
 SAMPLE = 0.001  # s
+STOP = (
+    0.6  # s of its plan that a vehicle passes while it brakes: half the duration of a stop (flight/setpoints/stops.py)
+)
 _BETWEEN = 1e-4  # m, error of linear interpolation between setpoints, at most 5 m/s² · (10 ms)² / 8
 
 
@@ -62,9 +66,21 @@ def separations(members: Sequence[FleetMember], skew: float) -> tuple[Separation
 def _separation(a: FleetMember, b: FleetMember, of_a: NDArray, of_b: NDArray, skew: float) -> Separation:
     band = int(np.ceil(skew / SAMPLE)) + 1
     distance, row, other = _nearest(of_a, of_b, band)
+    middle = 0.5 * (of_a[row] + of_b[other])
+    near = [(distance, middle, SAMPLE * row), _while_waiting(a, b, skew), _while_waiting(b, a, skew)]
+    distance, middle, time = near[int(np.argmin([each[0] for each in near]))]  # argmin finds NaN
     moved = 0.5 * SAMPLE * (a.plan.limits.plan.speed + b.plan.limits.plan.speed) + _BETWEEN
-    x, y = (0.5 * (of_a[row] + of_b[other])).tolist()
-    return Separation((a.name, b.name), max(float(distance) - moved, 0.0), (x, y), SAMPLE * row)
+    x, y = middle.tolist()
+    return Separation((a.name, b.name), max(float(distance) - moved, 0.0), (x, y), time)
+
+
+def _while_waiting(a: FleetMember, b: FleetMember, skew: float) -> tuple[float, NDArray, float]:
+    """Return how near `a` may come to the start of `b` if all brake before `b` begins: distance, middle, time."""
+    times = np.arange(0.0, b.delay + STOP + skew + SAMPLE, SAMPLE)
+    columns, start = a.columns(times), b.columns(np.zeros(1))[0]
+    away = np.linalg.norm(columns - start, axis=1)
+    row = int(away.argmin())
+    return float(away[row]), 0.5 * (columns[row] + start), float(times[row])
 
 
 @njit(nogil=True, error_model="numpy")

@@ -25,8 +25,8 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 class Fleet:
     """Two vehicles 0.5 m from each other, as their conductor hears them."""
 
-    def __init__(self, delay=0.0):
-        self.places = {"left": (0.0, 0.0, 0.0), "right": (0.5, 0.0, 0.0)}
+    def __init__(self, delay=0.0, right=(0.5, 0.0, 0.0)):
+        self.places = {"left": (0.0, 0.0, 0.0), "right": right}
         starts = {name: (x, y, 0.6) for name, (x, y, _) in self.places.items()}
         delays = {"left": 0.0, "right": delay}
         self.conductor = Conductor([ConductedFlight(name, starts[name], delays[name]) for name in starts], APART)
@@ -93,7 +93,7 @@ def test_a_vehicle_that_fails_preflight_keeps_all_on_the_floor():
 
 @pytest.mark.parametrize(("place", "text"), [
     ((0.25, 0.0, 0.0), "beside its start"), ((0.0, 0.05, 0.0), "at the start of left"),
-    ((0.5, 0.2, 0.0), "0.20 m beside"),
+    ((0.5, 0.2, 0.0), "0.20 m beside"), ((0.5, 0.06, 0.0), "0.06 m beside"),
 ])  # fmt: skip
 def test_a_vehicle_that_does_not_stand_under_its_start_keeps_all_on_the_floor(place, text):
     fleet = Fleet()
@@ -103,6 +103,16 @@ def test_a_vehicle_that_does_not_stand_under_its_start_keeps_all_on_the_floor(pl
     assert braking(said) == {"left", "right"}
     assert not cleared(said, Phase.ARM)
     assert text in said["left"].brakes
+
+
+@pytest.mark.parametrize(("x", "stand"), [(0.29, True), (0.27, False)])
+def test_vehicles_stand_on_the_floor_as_far_apart_as_they_must_keep_in_the_air(x, stand):
+    fleet = Fleet(right=(0.31, 0.0, 0.0))
+    fleet.places["right"] = (x, 0.0, 0.0)
+    fleet.go_on(0.1)
+    said = fleet.ask(Phase.ARM)
+    assert bool(cleared(said, Phase.ARM)) is stand
+    assert ("stand 0.27 m apart" in said["left"].brakes) is not stand
 
 
 def test_the_next_takes_off_when_the_one_before_has_risen():

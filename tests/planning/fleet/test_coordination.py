@@ -1,15 +1,16 @@
 """Vehicles whose paths cross are kept apart, which a check that shares no code with the certificate finds too."""
 
 import math
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
 import pytest
 
 from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
-from cfplan.flight.setpoints.stops import stop_motion
+from cfplan.flight.setpoints.stops import stop_clock, stop_motion
 from cfplan.planning.fleet.coordination import Blocked, coordinate
-from cfplan.planning.fleet.separation import separations
+from cfplan.planning.fleet.separation import STOP, separations
 
 APART, SKEW = 0.30, 0.03
 WALLS = (-1.5, 1.5)
@@ -70,16 +71,53 @@ def test_coordinated_vehicles_keep_their_limits_and_lose_little_time(crossing, c
     assert alone <= max(each.end for each in coordinated) < 1.5 * alone
 
 
-def test_joint_stops_keep_apart_from_every_tick(coordinated, limits):
-    motions = [encode_trajectory(each.plan.trajectory, space=limits.space).motion for each in coordinated]
-    ticks = np.arange(0, int(max(each.end for each in coordinated) * RATE), 5)
+def joint_stop(a, b, space):
+    """The least distance of two vehicles that brake at one tick, by the setpoints of their stops."""
+    ticks = np.arange(0, int(max(a.end, b.end) * RATE), 2)
     places = []
-    for each, motion in zip(coordinated, motions, strict=True):
-        rows = np.clip(ticks - round(each.delay * RATE), 0, len(motion.position) - 1)
-        stops, _ = stop_motion(motion, rows, RATE)
-        places.append(stops.position.reshape(len(ticks), -1, 3)[..., :2])
-    for a, b in combinations(places, 2):
-        assert np.linalg.norm(a - b, axis=2).min() >= APART - 1e-3
+    for each in (a, b):
+        motion = encode_trajectory(each.plan.trajectory, space=space).motion
+        rows = ticks - round(each.delay * RATE)
+        stops, _ = stop_motion(motion, np.clip(rows, 0, len(motion.position) - 1), RATE)
+        way = stops.position.reshape(len(ticks), -1, 3)[..., :2]
+        places.append(np.where((rows < 0)[:, None, None], motion.position[0, :2], way))  # waiting, it stays
+    return float(np.linalg.norm(places[0] - places[1], axis=2).min())
+
+
+def test_joint_stops_keep_apart_from_every_tick(coordinated, limits):
+    for a, b in combinations(coordinated, 2):
+        assert joint_stop(a, b, limits.space) >= APART - 1e-3
+
+
+@pytest.fixture(scope="module")
+def leaving(member):
+    """One that passes close by the start of another."""
+    return member("by", (WALLS[0], 0, 1), (WALLS[1], 0, 1)), member("leaves", (0, 0.15, 1), (0, WALLS[1], 1))
+
+
+def test_a_stop_before_a_vehicle_has_begun_counts(leaving, limits):
+    """It begins soon enough to be away when the other comes, but not if both are told to brake just before."""
+    by, leaves = leaving
+    waits = replace(leaves, delay=0.5 * by.end - 0.55)
+    assert nearest(by, waits, SKEW) >= APART
+    (found,) = separations((by, waits), SKEW)
+    dense = joint_stop(by, waits, limits.space)
+    assert found.distance < dense + 1e-3
+    assert dense < 0.2
+    assert waits.delay <= found.time <= waits.delay + STOP + SKEW + 1e-2
+    assert separations((waits, by), SKEW)[0].distance == pytest.approx(found.distance, abs=1e-3)
+
+
+def test_coordination_regards_stops_before_a_vehicle_has_begun(leaving, member, limits):
+    """The fastest clocks would let one wait for a third until the first is about to come by."""
+    by, leaves = leaving
+    third = member("third", (0.9, 0.65, 1), (WALLS[0], 0.65, 1))
+    made = coordinate((by, third, leaves), APART, SKEW, lambda same: same)
+    assert isinstance(made, Blocked) or min(joint_stop(*pair, limits.space) for pair in combinations(made, 2)) >= APART
+
+
+def test_a_stop_goes_on_as_long_as_its_clock():
+    assert pytest.approx(stop_clock(RATE)[0][-1] / RATE) == STOP
 
 
 def test_a_wider_skew_needs_more_room(coordinated):

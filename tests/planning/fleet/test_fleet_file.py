@@ -49,7 +49,8 @@ def test_each_path_is_turned_and_moved_to_its_place(fleet_file):
         (TWO.replace("path: line.yaml, place", "path: none.yaml, place"), "no such path file", 3),
         ("".join(TWO.splitlines(keepends=True)[:2]), "2 to 6 vehicles, not 1", 1),
         (TWO + "".join(f"  v{n}: {{path: line.yaml, place: {{y: {n}}}}}\n" for n in range(2, 7)), "not 7", 1),
-        ("apart: 0.1\n" + TWO, "apart", 1),
+        ("apart: 0.29\n" + TWO, "apart: must be at least 0.3 m", 1),
+        ("skew: 0.02\n" + TWO, "skew: must be at least 0.03 s", 1),
         ("skew: 1\n" + TWO, "skew", 1),
     ],
 )

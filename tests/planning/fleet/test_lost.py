@@ -56,6 +56,8 @@ def stopping(member, encoded, loss: float, begins: float, late: float) -> np.nda
     """The places, (M, 2) m at each 10 ms after a loss, of a vehicle that brakes then by a clock that is late."""
     motion = encoded(member.plan).motion
     own = np.round((loss + late - member.delay) * RATE) + np.arange(round(begins * RATE) + 1)
+    if own[-1] < 0:
+        return motion.position[:1, :2]  # it stays at its start
     rows = np.clip(own, 0, len(motion.position) - 1).astype(int)
     stops, _ = stop_motion(motion, rows[-1:], RATE)
     return np.concatenate([motion.position[rows[:-1]], stops.position])[:, :2]
@@ -92,6 +94,31 @@ def test_the_certified_distance_is_never_above_that_of_simulations(coordinated, 
                 others = stopping(other, encoded, lost.delay + row / RATE, begins, late)
                 least = min(least, *(apart(way, others) for way in ways))
         assert CLEARANCE <= of_vehicle[lost.name].distance < least + 0.01
+
+
+@pytest.mark.parametrize("gap", [0.35, 0.6])
+def test_hovering_at_its_start_beside_a_lost_vehicle_counts(member, encoded, model, limits, gap):
+    """Both paths lead away from each other, so that the two are nearest before they begin."""
+    fleet = member("up", (0, gap, 1), (0, 1.6 + gap, 1)), member("down", (0, 0, 1), (0, -1.6, 1))
+    (worst, _) = model().losses(fleet, (0, 1), SKEW)
+    payloads, least = encoded(fleet[0].plan).payloads, np.inf
+    for off in (0, 1040):
+        way = fly_on(payloads, limits.airframe, 0, lag=limits.airframe.motor_time_constant, off_after=off)
+        least = min(least, apart(way, stopping(fleet[1], encoded, -1.0, NOTICED[1], 0.0)))
+    assert worst.distance < least + 0.01
+    assert worst.keeps(CLEARANCE) is (gap == 0.6)
+
+
+def test_a_vehicle_that_waits_when_told_to_brake_stays_at_its_start(crossing):
+    """Long after the loss the tube is at the start of the other, which would have begun 0.3 s after the loss."""
+    other = crossing[0].plan
+    start = other.path(np.zeros(1))[0]
+    boxes = np.full((1, 1, 60, 2, 3), 50.0)
+    boxes[0, 0, 25:] = start  # from 1 s on
+    tube = Tube(boxes, RATE, 0.04)
+    braking = distances(tube, np.zeros(4), (other, np.array([-0.5, -0.3, -0.05, 0.5])), STOP, SKEW)
+    assert braking[:3] == pytest.approx(0.0, abs=0.02)
+    assert braking[3] > 0.2
 
 
 @pytest.mark.slow
