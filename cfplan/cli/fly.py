@@ -114,12 +114,11 @@ def fly(
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
         flight_options = options.flight_options(planning, safety_file, path_or_plan)
-        prepared = _preparation(on_board, after, planning, uri)(path_or_plan, limits, flight_options, steps)
-        name, speed_factor = prepared.planned.name, planning["speed_factor"]
-        if not confirmed({uri: prepared}, name, records, yes=yes, speed_factor=speed_factor):
+        flight = _preparation(on_board, after, planning, uri)(path_or_plan, limits, flight_options, steps)
+        if not confirmed({uri: flight}, flight.planned.name, records, yes=yes, speed_factor=planning["speed_factor"]):
             return int(ExitCode.ENDED_BY_OPERATOR)
-        flown = fly_and_record(prepared, path_or_plan, records, vehicle, watched, steps)
-    return _print_result(prepared, flown, as_json)
+        flown = fly_and_record(flight, path_or_plan, records, vehicle, watched, steps)
+    return _print_result(flight, flown, as_json)
 
 
 def _fly_fleet(
