@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-PATIENCE = 60.0  # s of the computer's time, spent only where something never happens
+PATIENCE = 200.0  # s of the computer's time, spent only where something never happens
 _LOOK_PERIOD = 0.005  # s
 
 
