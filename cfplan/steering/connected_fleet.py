@@ -163,7 +163,7 @@ class ConnectedFleet:
 
     @property
     def time(self) -> float:
-        """Return the time, s, on the flight's clock, of which only differences mean anything."""
+        """Return the time, s, on the flight's clock, whose zero is arbitrary."""
         return REAL_CLOCK.now()
 
     @property

@@ -98,7 +98,7 @@ class SteeredVehicle:
 
     @property
     def time(self) -> float:
-        """Return the time, s, on the flight's clock, of which only differences mean anything."""
+        """Return the time, s, on the flight's clock, whose zero is arbitrary."""
         return self._flight.clock.now()
 
     @property

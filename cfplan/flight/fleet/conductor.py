@@ -41,7 +41,7 @@ from cfplan.flight.telemetry import (
 
 STANDS_WITHIN = 0.05  # m beside the column of its start that a vehicle may stand
 TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
-STANDS_NEARER = 0.02  # m by which two may stand nearer than they keep apart in the air: errors of the poses
+STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: error of the poses
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""

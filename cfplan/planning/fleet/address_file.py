@@ -6,7 +6,7 @@ robots:                     # crazyswarm2: vehicles by name
 units:                      # cfcli: a list of vehicles
   - {uri: radio://0/80/2M/E7E7E7E701, name: cf1}
 
-Only names, addresses and `enabled` are read; whatever else such a file has is for its own tool.
+Only names, addresses and `enabled` are read; all other keys are ignored.
 """
 
 import difflib

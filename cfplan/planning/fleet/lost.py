@@ -8,8 +8,8 @@ compared with each other too.
 While a lost vehicle is in the air, the others keep away from its tube at all heights. Once it lies, they may pass over
 it, but none may stop or end above it.
 
-A vehicle that waits at its start when it is told to brake stays there. At the fleet's start all wait, or may do so by
-the skew, so the first moment also covers the time before it, when all hover at their starts.
+A vehicle that still waits at its start stays there when all brake. Within the skew of the fleet's start every vehicle
+may still wait, so the first moment also covers the time before, when all hover at their starts.
 
 A vehicle that is lost while it brakes for another reason is not part of this certificate.
 """

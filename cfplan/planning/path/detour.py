@@ -1,7 +1,7 @@
 """Corners of a short way around obstacles, where the straight way between two waypoints is blocked.
 
 The way is the shortest on a grid of the free space, without corners that can be skipped in a straight line. The search
-for a path begins with it. It determines on which side the path passes each obstacle.
+for a path begins with it; it determines the side on which the path passes each obstacle.
 """
 
 import itertools

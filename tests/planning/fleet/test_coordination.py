@@ -96,7 +96,7 @@ def leaving(member):
 
 
 def test_a_stop_before_a_vehicle_has_begun_counts(leaving, limits):
-    """It begins soon enough to be away when the other comes, but not if both are told to brake just before."""
+    """The waiting vehicle leaves before the other arrives, but not if both brake just before it begins."""
     by, leaves = leaving
     waits = replace(leaves, delay=0.5 * by.end - 0.55)
     assert nearest(by, waits, SKEW) >= APART
