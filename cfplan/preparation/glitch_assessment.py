@@ -9,6 +9,7 @@ from cfplan.safety.limits import Limits
 from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_sampled_setpoints
 
 KEPT = 0.9  # usage that planning keeps; at 1 the vehicle counts as lost
+_ABOUT = (0.0, GAP + 0.3)  # s before and after a setpoint at fault, to be slowed: the gap, and the catching up
 _HINT = "make the path gentler there, or plan with a lower speed or acceleration"
 
 
@@ -26,4 +27,4 @@ def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
     def near(at: int) -> str:
         return f"{coordinates(encoded.decoded.position[at], '.2f')} m"
 
-    return Assessment("a gap", encoded.times, share - KEPT, share, describe, near, _HINT)
+    return Assessment("a gap", encoded.times, share - KEPT, share, describe, near, _HINT, about=_ABOUT)

@@ -27,7 +27,7 @@ TRIALS, CHEAP = 4, 0.005  # attempts to regain time, if a plan loses more than t
 PLACES = 4  # of caps per interval
 LEAST_SHARE, MOST_SHARE = 0.5, 0.98  # fractions of its speed to which a place is slowed in one round
 POWER = 1.5  # of speed, with which the remaining distance grows: part of it is v t, part v² / a
-ABOUT = 0.1  # s of flight around a setpoint at fault, slowed in the first round; later rounds slow more
+ABOUT = (0.1, 0.1)  # s of flight before and after a setpoint at fault, slowed in the first round; later ones slow more
 LEAST_SPEED = 0.05  # m/s, of caps
 LEADING_UP = 0.4  # s around a setpoint that affect its end: if all caps there are at the minimum, nothing helps
 
@@ -52,6 +52,7 @@ class Assessment:
     near: Callable[[int], str]  # of a setpoint at fault: "the wall x = 2.25 m"
     hint: str  # remedy if slowing does not help
     simulated: SimulatedLinkLoss | None = None  # the simulation behind an assessment of link loss
+    about: tuple[float, float] = ABOUT  # s of flight before and after a setpoint at fault, whose speed matters to it
 
     @property
     def worst(self) -> int:
@@ -111,23 +112,24 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
 def _faster(
     plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps, deadline: Deadline
 ) -> tuple[Plan, Sequence[Assessment]]:
-    """Return a faster plan that passes too: caps are raised half-way as long as no setpoint fails."""
+    """Return a faster plan that passes too: at every place the cap is sought by halving, between one that passes and
+    one that is too high near a setpoint that fails.
+    """
     places = np.array(caps.s)
-    highest = np.minimum(_speed_at(plan.trajectory, places), plan.limits.plan.speed)
-    raised = highest > caps.speed
+    highest = np.maximum(np.minimum(_speed_at(plan.trajectory, places), plan.limits.plan.speed), caps.speed)
     for _ in range(TRIALS):
         slowed = passed[0]
-        if slowed.slowing is None or slowed.time_lost <= CHEAP or not raised.any() or deadline.passed:
+        if slowed.slowing is None or slowed.time_lost <= CHEAP or (highest <= caps.speed).all() or deadline.passed:
             break
-        between = np.sqrt(np.array(caps.speed) * np.maximum(highest, caps.speed))
-        trial = SpeedCaps.of(places, np.where(raised, between, caps.speed))
+        between = np.sqrt(np.array(caps.speed) * highest)
+        trial = SpeedCaps.of(places, between)
         # Refining from the slow plan would gain nothing.
         faster = under_caps(plan, plan, trial, slowed.slowing.reasons, deadline)
         assessed = assess(faster.trajectory)
         if not _passed(assessed):
             for each in assessed:
-                for first, last in zip(*_about(faster.trajectory, each, places, LEADING_UP), strict=True):
-                    raised[first : last + 1] = False
+                for first, last in zip(*_about(faster.trajectory, each, places, (LEADING_UP,) * 2), strict=True):
+                    highest[first : last + 1] = between[first : last + 1]
         elif faster.trajectory.duration < slowed.trajectory.duration:
             passed, caps = (faster, assessed), trial
         else:
@@ -154,22 +156,25 @@ def _lowered(trajectory: Trajectory, assessment: Assessment, caps: SpeedCaps, do
     at_fault = np.flatnonzero(assessment.at_fault)
     excess, reach = np.nan_to_num(assessment.excess[at_fault], nan=np.inf), assessment.reach[at_fault]
     share = np.minimum(np.maximum(1.0 - excess / reach, 0.0) ** (1.0 / POWER), MOST_SHARE) ** (1 + 0.5 * done)
-    first, last = _about(trajectory, assessment, s, (1 + 0.5 * done) * ABOUT)
+    ahead, after = assessment.about
+    first, last = _about(trajectory, assessment, s, ((1 + 0.5 * done) * ahead, (1 + 0.5 * done) * after))
     factor = np.ones(len(s))
     for begin, end, one in zip(first, last, np.maximum(share, LEAST_SHARE), strict=True):
         factor[begin : end + 1] = np.minimum(factor[begin : end + 1], one)
     lower = np.where(factor < 1.0, np.maximum(factor * speed, LEAST_SPEED), np.inf)
-    leading_up = _about(trajectory, assessment, s, LEADING_UP)
+    leading_up = _about(trajectory, assessment, s, (LEADING_UP, LEADING_UP))
     if any((before[begin : end + 1] <= LEAST_SPEED).all() for begin, end in zip(*leading_up, strict=True)):
         return None
     return SpeedCaps.of(s, np.minimum(before, lower))
 
 
-def _about(trajectory: Trajectory, assessment: Assessment, s: NDArray, about: float) -> tuple[NDArray, NDArray]:
-    """Return the first and the last of the places s, (K,), within `about` s of each setpoint at fault."""
+def _about(
+    trajectory: Trajectory, assessment: Assessment, s: NDArray, about: tuple[float, float]
+) -> tuple[NDArray, NDArray]:
+    """Return the first and last of the places s, (K,), within `about`, s, before and after each setpoint at fault."""
     time = assessment.time[assessment.at_fault]
-    first = np.searchsorted(s, trajectory.s_at(time - about), side="right") - 1
-    return first, np.minimum(np.searchsorted(s, trajectory.s_at(time + about)), len(s) - 1)
+    first = np.searchsorted(s, trajectory.s_at(time - about[0]), side="right") - 1
+    return first, np.minimum(np.searchsorted(s, trajectory.s_at(time + about[1])), len(s) - 1)
 
 
 def _places(profile: SpeedProfile) -> NDArray:

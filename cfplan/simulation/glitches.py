@@ -1,9 +1,10 @@
 """Glitch margin: the effect of a gap in setpoints, in poses, or in both, beginning at any setpoint.
 
-The flight is simulated once, as in the dry run, and branches off at each setpoint. During the gap the vehicle keeps its
-last setpoint; without poses it flies on by gyroscope and accelerometer, and an error of its attitude makes the estimate
-drift. After the gap, the setpoints that are due by the clock arrive again, and poses. The vehicle is lost if it then
-deviates so far that the pilot would cut its motors, or tilts so far that it turns over.
+The flight of the nominal vehicle is simulated once and branches off at each setpoint; its estimate of position and
+velocity is late all the time. During the gap the vehicle keeps its last setpoint; without poses it flies on by
+gyroscope and accelerometer, and an error of its attitude makes the estimate drift. After the gap, the setpoints that
+are due by the clock arrive again, and poses. The vehicle is lost if it then deviates so far that the pilot would cut
+its motors, or tilts so far that it turns over.
 
 In 0.2 s an attitude error of 1° makes an error of 3 cm/s in the estimate, which adds less than 3 cm to the effect of a
 gap in setpoints. So gaps in poses begin at every fifth setpoint only; between two of these the worse one counts, if it
@@ -29,6 +30,7 @@ from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
+LATENCY = 10  # ms by which the estimate is late; in dry runs positions are up to 6 and velocities up to 9 ms late
 AFTERWARDS = 2.0  # s simulated after the gap: at little thrust a vehicle may stray for 1.5 s until it is lost
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
@@ -144,7 +146,8 @@ def _fly_without(payloads: NDArray, limits: Limits, rate: float, gap: float, sta
     begin = hovering_snapshot(limits.airframe, state) if start is None else start
     packed = pack_airframe(limits.airframe, floor=NO_FLOOR)[None]
     batch = Vehicles(begin[None], packed, first, first + len(rows) - 1, first, np.zeros((1, 3)))
-    schedule = Schedule(rows, arrivals, gains_for(limits.airframe).pack(), steps=int(arrivals[-1]) + watched + 1)
+    steps, gains = int(arrivals[-1]) + watched + 1, gains_for(limits.airframe).pack()
+    schedule = Schedule(rows, arrivals, gains, steps=steps, latency=LATENCY)
     flown = simulate(batch, schedule, arrived=len(rows), trace=True)
     moved = flown.trace[0, 1:]
     due = rows[np.searchsorted(arrivals, np.arange(len(moved)), side="right") - 1, :3]
@@ -171,7 +174,7 @@ def _gaps(flight: _Flight, wanted: NDArray, limits: Limits, gap: float) -> NDArr
     )  # fmt: skip
     schedule = Schedule(
         flight.rows, flight.arrivals, gains_for(limits.airframe).pack(),
-        steps=(milliseconds + round(1000 * AFTERWARDS)) // _STEP, step=_STEP, blind_until=milliseconds,
+        steps=(milliseconds + round(1000 * AFTERWARDS)) // _STEP, step=_STEP, blind_until=milliseconds, latency=LATENCY,
     )  # fmt: skip
     found, worst = simulate(batch, schedule), np.full((2, *wanted.shape), np.nan)
     worst[:, kind, number] = np.nan_to_num((found.deviation, found.tilt), nan=np.inf)  # NaN: not simulated

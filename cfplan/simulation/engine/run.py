@@ -84,7 +84,7 @@ class Schedule(NamedTuple):
     level_after: int = NEVER  # ms after which the vehicle levels out
     off_after: int = NEVER  # ms after which motors stop, for good; the simulation ends on the floor then
     spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
-    latency: int = 0  # ms, delay of the estimate; used with traces
+    latency: int = 0  # ms, a multiple of the step, by which estimated position and velocity are late
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
     part: int = PART  # ms of motion per box, if there are several
 
@@ -138,6 +138,7 @@ class _Lanes(NamedTuple):
 
     values: NDArray  # (_ROWS * WIDTH,) as in `layout`
     newest: NDArray  # (WIDTH,) int, row of the setpoint that is due
+    past: NDArray  # (K, 6 * WIDTH) position and velocity in the last K steps, by which the estimate is late; a ring
     first: int  # number of the vehicle in the first lane
     size: int  # how many of the lanes are used
 
@@ -145,8 +146,9 @@ class _Lanes(NamedTuple):
 @njit(nogil=True, error_model="numpy")
 def _run(batch: Vehicles, schedule: Schedule, found: Outcome) -> None:
     values, newest = np.zeros(_ROWS * WIDTH), np.zeros(WIDTH, dtype=np.int64)
+    past = np.zeros((schedule.latency // schedule.step, 6 * WIDTH))
     for first in range(0, len(batch.snapshots), WIDTH):
-        _fly(_Lanes(values, newest, first, min(WIDTH, len(batch.snapshots) - first)), batch, schedule, found)
+        _fly(_Lanes(values, newest, past, first, min(WIDTH, len(batch.snapshots) - first)), batch, schedule, found)
 
 
 @njit(allocates=False, error_model="numpy")
@@ -162,8 +164,10 @@ def _fly(lanes: _Lanes, batch: Vehicles, schedule: Schedule, found: Outcome) -> 
         if len(found.trace) > 0:
             _note_step(lanes, found, k)
         _drop_poses(values, used, 0.001 * now if now < schedule.blind_until else 0.0)
-        if schedule.latency > 0 or len(schedule.noise) > 0:
-            _add_estimate_errors(lanes, schedule, found, k)
+        if len(lanes.past) > 0:
+            _add_lateness(values, used, lanes.past[k % len(lanes.past)])
+        if len(schedule.noise) > 0:
+            _add_noise(values, used, schedule.noise[k])
         _supervise(values, schedule, now)
         if now < schedule.off_after and now % schedule.control == 0:
             levels, period = now >= schedule.level_after, 0.001 * schedule.control
@@ -192,6 +196,10 @@ def _begin(lanes: _Lanes, batch: Vehicles, schedule: Schedule) -> None:
         for k in range(3):
             values[(_LOW + k) * WIDTH + n] = values[(_HIGH + k) * WIDTH + n] = batch.snapshots[number, k]
             values[(_BLIND + k) * WIDTH + n] = batch.blind[number, k]
+            for age in range(len(lanes.past)):  # before the beginning, as if its velocity had been constant
+                slot, speed = lanes.past[-1 - age], batch.snapshots[number, 3 + k]
+                slot[k * WIDTH + n] = batch.snapshots[number, k] - 0.001 * schedule.step * (age + 1) * speed
+                slot[(3 + k) * WIDTH + n] = speed
         values[_FARTHEST * WIDTH + n], values[_LEAST_LIFT * WIDTH + n] = 0.0, 1.0
         lanes.newest[n] = batch.first[number]
         _take_setpoint(values, n, schedule.setpoints[lanes.newest[n]])
@@ -289,15 +297,23 @@ def _drop_poses(lanes: NDArray, count: int, blind_for: float) -> None:
         write_vector(lanes, WIDTH, n, MISSED + 3, (blind_for * x, blind_for * y, blind_for * z))
 
 
-@register_jitable
-def _add_estimate_errors(lanes: _Lanes, schedule: Schedule, found: Outcome, k: int) -> None:
-    """Add latency and noise to the errors of all estimates."""
-    seen = max(k - schedule.latency // schedule.step, 0)
-    for n in range(lanes.size):
-        for row in range(6):
-            late = lanes.values[row * WIDTH + n] - found.trace[lanes.first + n, seen, row]
-            noise = schedule.noise[k, row] if len(schedule.noise) > 0 else 0.0
-            lanes.values[(MISSED + row) * WIDTH + n] += late - noise
+@njit(allocates=False, error_model="numpy")
+def _add_lateness(lanes: NDArray, count: int, seen: NDArray) -> None:
+    """Let all estimates be what was true as many steps ago as the ring has rows; `seen`, its oldest, gets the truth."""
+    count = min(count, WIDTH)
+    for row in range(6):
+        for n in range(count):
+            true = lanes[row * WIDTH + n]
+            lanes[(MISSED + row) * WIDTH + n] += true - seen[row * WIDTH + n]
+            seen[row * WIDTH + n] = true
+
+
+@njit(allocates=False, error_model="numpy")
+def _add_noise(lanes: NDArray, count: int, noise: NDArray) -> None:
+    count = min(count, WIDTH)
+    for row in range(6):
+        for n in range(count):
+            lanes[(MISSED + row) * WIDTH + n] -= noise[row]
 
 
 @njit(allocates=False, error_model="numpy")
