@@ -20,7 +20,7 @@ from cfplan.planning.continuation import with_room
 from cfplan.planning.plan import plan
 from cfplan.safety.certificate import certify
 from cfplan.simulation.dry_run import fly_motion, rehearse_motion, rehearse_setpoints
-from cfplan.simulation.glitches import glitch_at_every_setpoint
+from cfplan.simulation.glitches import LATENCY, glitch_at_every_setpoint
 from cfplan.simulation.link_loss import as_believed, link_loss_at_every_setpoint
 
 WAYPOINTS = np.array([[-1.0, -2.0, 0.8], [0.8, -1.0, 1.1], [-0.6, 0.6, 0.9], [0.7, 1.8, 1.1]])
@@ -47,7 +47,9 @@ def encoded_from(timeline, first, limits):
 
 
 def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits):
-    """Link loss and gaps from setpoint 150 on are to the last digit those of the whole flight, the dry run to 10 µm."""
+    """Link loss from setpoint 150 on is to the last digit that of the whole flight, the dry run to 10 µm. Gaps are
+    not: the snapshot is of a vehicle that knows its state, which is not ahead by its speed times the lateness.
+    """
     payloads, begin = held.commitment.payloads, 150
     whole = link_loss_at_every_setpoint(payloads, limits)
     starts = whole.snapshots[:, begin]
@@ -57,8 +59,10 @@ def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits)
 
     believed = as_believed(starts, limits)
     gaps = glitch_at_every_setpoint(payloads, limits)
-    np.testing.assert_array_equal(
-        glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation, gaps.deviation[:, begin:]
+    np.testing.assert_allclose(
+        glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation,
+        gaps.deviation[:, begin:],
+        atol=limits.plan.speed * LATENCY / 1000,
     )
     flown, later = held.motion, held.motion.since(begin / RATE)
     at_once = fly_motion(

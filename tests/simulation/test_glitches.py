@@ -10,13 +10,14 @@ import pytest
 from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.engine.flight import fly_setpoints
+from cfplan.simulation.engine.flight import Conditions, EstimateErrors, fly_setpoints
 from cfplan.simulation.engine.layout import hovering
 from cfplan.simulation.glitches import (
     AFTERWARDS,
     CRITICAL_USAGE,
     GAP,
     KINDS,
+    LATENCY,
     TURNED_OVER,
     WITHOUT_POSES_EVERY,
     glitch_at_every_setpoint,
@@ -24,6 +25,7 @@ from cfplan.simulation.glitches import (
 )
 
 REPOSITORY = Path(__file__).parents[2]
+LATE = Conditions(estimate=EstimateErrors(latency=LATENCY / 1000))
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,7 @@ def test_a_gap_in_setpoints_does_what_the_dry_run_says_of_a_flight_with_that_gap
     held = np.where((rows > number) & (rows < number + round(100 * GAP)), number, rows)
     start = hovering(limits.airframe, decode(line).position[0])
     end = number / 100 + GAP + AFTERWARDS
-    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, end)
+    flown = fly_setpoints(decode(line[held]), rows / 100, limits.airframe, start, end, LATE)
     since = np.arange(10 * number, round(1000 * end))
     due = decode(line).position[np.minimum(since // 10, len(line) - 1)]
     off = np.linalg.norm(flown.position[since] - due, axis=1).max()
@@ -67,6 +69,7 @@ def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limit
         limits.airframe,
         start,
         duration=end,
+        conditions=LATE,
     )
     since = np.arange(round(1000 * end))
     off = np.linalg.norm(
@@ -81,8 +84,9 @@ def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limit
 
 
 def test_a_flight_without_a_gap_stays_on_its_setpoints(line, limits):
+    """It flies ahead by its speed times the lateness of its estimate."""
     without = glitch_at_every_setpoint(line, limits, gap=0.0)
-    assert without.deviation.max() < 0.03
+    assert without.deviation.max() < 0.03 + limits.plan.speed * LATENCY / 1000
     assert not without.lost.any()
 
 
@@ -98,7 +102,7 @@ def test_without_poses_a_wrong_attitude_carries_the_vehicle_off(line, limits):
         return glitch_at_every_setpoint(line, wrong).deviation[1]
 
     right, wrong = poses_missing(0.0), poses_missing(3.0)
-    assert right.max() < 0.03
+    assert right.max() < 0.03 + limits.plan.speed * LATENCY / 1000
     assert 0.005 < (wrong - right).max() < 0.1  # 0.5 m/s² for 0.2 s is 1 cm, and 10 cm/s to be taken back
 
 
