@@ -2,25 +2,29 @@
 
 import math
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Annotated, Any, TypeVar, get_args, get_type_hints
 
+from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel, ConfigDict, create_model
 
 Kind = TypeVar("Kind")
 
 
-class Section(BaseModel):
-    """Keys with values, all of them known, all numbers finite."""
+class Keys(BaseModel):
+    """Keys with values, all keys known, all numbers finite."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 @dataclass(frozen=True, slots=True)
 class InDegrees:
-    """Marks an angle in rad that files give in degrees, by the same key with `_deg`; its range is in degrees too."""
+    """Marks an angle in rad that files give in degrees, by the same key with `_deg`, with its range in the file."""
+
+    low: Ge | Gt  # °
+    high: Le | Lt  # °
 
 
-def schema_of(kind: type, **others: Any) -> type[Section]:
+def schema_of(kind: type, **others: Any) -> type[Keys]:
     """Return the model of a file with the fields of a dataclass, with their ranges and defaults.
 
     Fields that are dataclasses are sections. `others` are annotations of keys that the file has instead of fields, or
@@ -35,14 +39,15 @@ def schema_of(kind: type, **others: Any) -> type[Section]:
         if isinstance(hint, type) and is_dataclass(hint):
             section = schema_of(hint)
             keys[field.name] = (section, ... if default is MISSING else section())
-        elif _in_degrees(hint):
-            keys[f"{field.name}_deg"] = (hint, ... if default is MISSING else math.degrees(default))
+        elif angle := _in_degrees(hint):
+            degrees = Annotated[float, angle.low, angle.high]
+            keys[f"{field.name}_deg"] = (degrees, ... if default is MISSING else math.degrees(default))
         else:
             keys[field.name] = (hint, ... if default is MISSING else default)
-    return create_model(f"_{kind.__name__}", __base__=Section, **keys)
+    return create_model(f"_{kind.__name__}", __base__=Keys, **keys)
 
 
-def read_as(kind: type[Kind], section: Section, **others: Any) -> Kind:
+def read_as(kind: type[Kind], section: Keys, **others: Any) -> Kind:
     """Return the dataclass of a section by `schema_of`; `others` are the values of fields that the file has not."""
     hints = get_type_hints(kind, include_extras=True)
     values: dict[str, Any] = {}
@@ -55,5 +60,5 @@ def read_as(kind: type[Kind], section: Section, **others: Any) -> Kind:
     return kind(**values, **others)
 
 
-def _in_degrees(hint: Any) -> bool:
-    return any(isinstance(part, InDegrees) for part in get_args(hint)[1:])
+def _in_degrees(hint: Any) -> InDegrees | None:
+    return next((part for part in get_args(hint)[1:] if isinstance(part, InDegrees)), None)

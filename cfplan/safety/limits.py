@@ -18,7 +18,7 @@ LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: range of a setpoint's 16 bit
 # What safety.yaml may state; times in s.
 Encodable = Annotated[float, Gt(0.0), Le(LARGEST_IN_PACKET)]
 Positive = Annotated[float, Gt(0.0), Le(1000.0)]
-Tilt = Annotated[float, InDegrees(), Gt(0.0), Lt(90.0)]
+Tilt = Annotated[float, InDegrees(Gt(0.0), Lt(90.0))]
 _MotorLag = Annotated[float, Ge(0.005), Le(0.5)]
 _Voltage = Annotated[float, Ge(2.5), Le(4.35)]
 _UpToOne = Annotated[float, Gt(0.0), Le(1.0)]
@@ -35,7 +35,7 @@ class PlanLimits:
     motor_thrust_min: float  # N, each motor
     motor_thrust_max: float  # N, each motor, less the reserve for feedback
     specific_thrust_min: float  # m/s², collective thrust over mass
-    angular_acceleration: Positive = math.inf  # rad/s², norm: motors take a tenth of a second to follow
+    angular_acceleration: float = math.inf  # rad/s², norm: motors take a tenth of a second to follow
 
 
 def within_reserve(airframe: Airframe, reserve: float) -> dict[str, float]:
@@ -89,9 +89,9 @@ class PoseLimits:
     age_land: Annotated[float, Gt(0.0), Le(2.0)]  # s
     jump: _UpToOne  # m, largest distance of a pose from the extrapolated position
     agreement: _UpToOne  # m, largest distance between pose and the vehicle's own estimate
-    yaw_agreement: Annotated[float, InDegrees(), Gt(0.0), Le(90.0)]  # rad
+    yaw_agreement: Annotated[float, InDegrees(Gt(0.0), Le(90.0))]  # rad
     position_noise: Annotated[float, Gt(0.0), Le(0.1)] = 0.001  # m, standard deviation along each axis
-    attitude_noise: Annotated[float, InDegrees(), Gt(0.0), Le(10.0)] = math.radians(0.2)  # the same about each axis
+    attitude_noise: Annotated[float, InDegrees(Gt(0.0), Le(10.0))] = math.radians(0.2)  # the same about each axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ class LinkLossLimits:
 
     motor_lags: Annotated[tuple[_MotorLag, ...], Len(1, 5)] = (0.07, 0.105, 0.13)
     """s, with which this is simulated besides the airframe's own."""
-    attitude_error: Annotated[float, InDegrees(), Ge(0.0), Le(10.0)] = math.radians(1.0)
+    attitude_error: Annotated[float, InDegrees(Ge(0.0), Le(10.0))] = math.radians(1.0)
     """rad, error of the estimated attitude, in any direction."""
     vertical_acceleration_error: Annotated[float, Ge(0.0), Le(2.0)] = 0.08
     """m/s², error of the accelerometer, either sign."""

@@ -13,7 +13,7 @@ from annotated_types import Ge, Gt, Le, Len, Lt
 from pydantic import StringConstraints
 
 from cfplan.errors import CfplanError, InputError
-from cfplan.files.schema import Section, read_as, schema_of
+from cfplan.files.schema import Keys, read_as, schema_of
 from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
@@ -51,26 +51,26 @@ Coordinate = Annotated[float, Ge(-LARGEST_IN_PACKET), Le(LARGEST_IN_PACKET)]
 Corner = tuple[Coordinate, Coordinate, Coordinate]
 
 
-class _Box(Section):
+class _Box(Keys):
     low: Corner
     high: Corner
     yaw_deg: Annotated[float, Ge(-360.0), Le(360.0)] = 0.0
 
 
-class _Cylinder(Section):
+class _Cylinder(Keys):
     x: Coordinate
     y: Coordinate
     radius: Encodable
     height: Encodable
 
 
-class _Obstacle(Section):
+class _Obstacle(Keys):
     name: Annotated[str, Len(1, 40)] = ""
     box: _Box | None = None
     cylinder: _Cylinder | None = None
 
 
-class _Space(Section):
+class _Space(Keys):
     low: Corner
     high: Corner
     margin: Positive
@@ -84,8 +84,8 @@ _SafetyFile: Any = schema_of(
     airframe=None,  # it has a file of its own
     vehicle=Annotated[str, Len(1, 200)],
     plan=schema_of(
-        PlanLimits, motor_thrust_min=None, motor_thrust_max=None, specific_thrust_min=None,
-        motor_reserve=Annotated[float, Gt(0.0), Lt(0.5)], specific_thrust=Positive,
+        PlanLimits, angular_acceleration=Positive, motor_thrust_min=None, motor_thrust_max=None,
+        specific_thrust_min=None, motor_reserve=Annotated[float, Gt(0.0), Lt(0.5)], specific_thrust=Positive,
     ),
     space=_Space,
     firmware=schema_of(FirmwareSettings, oldest=_Version, newest=_Version),
