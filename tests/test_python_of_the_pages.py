@@ -17,6 +17,7 @@ RUN_BY = {  # what a page shows, by the test that runs it
     "docs/fleets.md": "tests/integration/test_fleet_in_real_time.py",
     "docs/python.md": "tests/test_python_of_the_pages.py",
     "docs/steering.md": "tests/test_python_of_the_pages.py",
+    "docs/virtual.md": "tests/simulation/lab/test_other_firmware.py",
 }
 
 

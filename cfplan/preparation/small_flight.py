@@ -29,8 +29,9 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.glitches import glitch_at_sampled_setpoints
 from cfplan.simulation.link_loss import link_loss_near_walls, link_loss_within_stops
-from cfplan.simulation.virtual_crazyflie.log_variables import log_variables
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.virtual_firmware import VirtualFirmware
 
 NODES = 12  # grid intervals; few enough that limits are exceeded between nodes
 PLACES = ((-0.2, -0.2, -0.1), (0.2, 0.0, 0.0), (0.2, 0.2, 0.1))  # m from the middle of the space
@@ -72,13 +73,8 @@ def _prepare(path_file: Path, limits: Limits) -> None:
 
 def _simulate(_path_file: Path, limits: Limits) -> None:
     """Let the virtual vehicle stand on the floor, and read all of its log variables."""
-    vehicle = VirtualCrazyflie(limits.airframe)
-    for _ in range(3):
-        vehicle.advance(10)
-    for value in log_variables(
-        vehicle.stabilizer.loop, localization=vehicle.localization, supervisor=vehicle.supervisor,
-        battery=vehicle.battery, airframe=limits.airframe, setpoint=lambda: vehicle.setpoint, info=lambda: 0,
-    ).values():  # fmt: skip
+    VirtualCrazyflie(limits.airframe, VehicleSettings(make_firmware=VirtualFirmware)).advance(30)
+    for value in VirtualFirmware(limits.airframe).log_variables().values():
         value()
 
 

@@ -54,7 +54,7 @@ class SteppedSteering:
         self._thread: threading.Thread | None = None
 
     def first_pose(self) -> tuple[Triple, float]:
-        x, y, z, *_, qx, qy, qz, qw = self.lab.vehicle.stabilizer.loop.truth.tolist()[:10]
+        x, y, z, *_, qx, qy, qz, qw = self.lab.vehicle.truth.tolist()[:10]
         return (x, y, z), yaw_of((qx, qy, qz, qw))
 
     def start(self, mission: Mission, timeline: Timeline, listeners: Listeners) -> None:

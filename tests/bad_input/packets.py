@@ -48,6 +48,7 @@ from tests.bad_input.faults import FLOATS, TEXTS, spoil_bytes, spoil_packets
 from tests.bad_input.files import MADE, SAFETY, Input
 
 _LARGEST_DATAGRAM = 65_000  # bytes
+_USES_POSES = {"stabilizer.estimator": 2.0}  # parameter stored in a vehicle
 _SINGLES = [value for value in FLOATS if not 3e38 < abs(value) < math.inf]  # finite in 32 bits, or not finite at all
 
 
@@ -312,16 +313,17 @@ def _use_uplink(folder: Path) -> None:
     """Send the packets to a virtual vehicle, 10 ms apart, and simulate one more second."""
     packets = _packets(folder)
     old = sum(map(len, packets)) % 4 == 0
-    settings = VehicleSettings(firmware="2025.02", protocol=10) if old else VehicleSettings()
+    stored = _USES_POSES if len(packets) % 2 else {}
+    settings = (
+        VehicleSettings(firmware="2025.02", protocol=10, stored=stored) if old else VehicleSettings(stored=stored)
+    )
     vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"], settings)
-    if len(packets) % 2:
-        vehicle.use_kalman()
     for packet in packets:
         vehicle.receive(packet)
         vehicle.advance(10)
         assert all(len(answer) <= 1 + LARGEST_PAYLOAD for answer in vehicle.sent())
     vehicle.advance(1000)
-    vehicle.info()
+    vehicle.firmware.info()
 
 
 # CRTP, from a vehicle
@@ -337,8 +339,7 @@ class _Driver(CRTPDriver):
     def connect(self, uri: str, statistics: object, error: object) -> None:
         if not uri.startswith("spoiled://"):
             raise WrongUriType("not mine")
-        self.vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"])
-        self.vehicle.use_kalman()
+        self.vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"], VehicleSettings(stored=_USES_POSES))
         self.coming: queue.SimpleQueue[bytes] = queue.SimpleQueue()
         self.idle = threading.Event()
         self._lock = threading.Lock()

@@ -24,13 +24,13 @@ SAFETY_FILE = Path(__file__).parents[2] / "safety.yaml"
 def look(monkeypatch):
     def with_settings(**settings):
         lab = SteppedLab(AIRFRAMES["crazyflie-2.1+"], vehicle=VehicleSettings(**settings))
-        known = [rule.name for rule in PARAMETER_RULES if rule.name in lab.vehicle.parameters.toc.index()]
-        before = {name: lab.vehicle.parameters[name] for name in known}
+        known = [rule.name for rule in PARAMETER_RULES if rule.name in lab.vehicle.firmware.parameters.toc.index()]
+        before = {name: lab.vehicle.firmware.parameters[name] for name in known}
         monkeypatch.setattr(connection, "connect", lambda uri, report, drivers: connect(lab, report))
         words = ["doctor", "--json", "--safety", str(SAFETY_FILE), "--uri", "udp://127.0.0.1:19850"]
         result = CliRunner().invoke(cfplan, words, standalone_mode=False)
         assert result.exception is None
-        assert {name: lab.vehicle.parameters[name] for name in known} == before
+        assert {name: lab.vehicle.firmware.parameters[name] for name in known} == before
         return {check["name"]: check for check in json.loads(result.stdout)["checks"]}, result.return_value
 
     return with_settings

@@ -61,7 +61,7 @@ def test_a_flow_deck_is_a_parameter_that_says_so():
     for flow_deck in (False, True):
         settings = VehicleSettings(stored={FLOW_DECK: 1.0} if flow_deck else {})
         vehicle = VirtualCrazyflie(load_limits(SAFETY).airframe, settings)
-        assert vehicle.parameters[FLOW_DECK] == flow_deck
+        assert vehicle.firmware.parameters[FLOW_DECK] == flow_deck
 
 
 def test_no_vehicle_has_a_flow_deck_and_its_poses_by_radio_alone():

@@ -87,6 +87,14 @@ def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, flown
         assert row.off_plan < 0.4
 
 
+@pytest.mark.parametrize("name", ["radio loses 50 %", "locked between arming and take-off", "two bodies swapped"])
+def test_another_firmware_comes_to_the_same_ends(name, flown, tmp_path, monkeypatch):
+    ours = flown(name)
+    monkeypatch.setenv("CFPLAN_FIRMWARE", "firmware_doubles:Failing")
+    work = STUDY.work(Settings(LINE), Run(tmp_path))
+    assert work.measure(work.cases[name]) == ours
+
+
 @pytest.mark.parametrize("scenario", [row for row in SCENARIOS if row.planner], ids=lambda row: row.name)
 def test_whatever_is_wrong_with_the_planner_the_flight_ends_in_the_committed_hover(scenario, flown, line):
     held = prepare_timeline(LINE, line.limits)

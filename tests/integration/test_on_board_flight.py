@@ -117,7 +117,7 @@ def test_what_is_uploaded_ends_on_the_floor_at_rest(line):
 
 def test_other_bytes_in_the_memory_keep_it_on_the_ground(line):
     lab = SteppedLab(LIMITS.airframe)
-    memories = lab.vehicle.memories
+    memories = lab.vehicle.firmware.memories
     write = memories.receive
 
     def spoilt(channel, payload):
@@ -195,14 +195,14 @@ def test_the_operator_ends_it_by_a_stop_of_a_second(line):
 
 def test_where_its_commander_refuses_to_land_setpoints_land_it(line):
     lab, orders = SteppedLab(LIMITS.airframe), HeldOrders()
-    receive = lab.vehicle.planner.receive
+    receive = lab.vehicle.firmware.planner.receive
 
     def refuse(payload, *rest, **more):
         if payload[0] == LAND:
             return bytes((LAND, 0, 0, 8))  # ENOEXEC
         return receive(payload, *rest, **more)
 
-    lab.vehicle.planner.receive = refuse
+    lab.vehicle.firmware.planner.receive = refuse
     row = len(line.mission.payloads) // 3
     flight = fly_stepped(line.mission, at_setpoint(row, lambda: orders.give(Order.LAND)), orders=orders, lab=lab)
     assert (flight.outcome.exit_code, flight.outcome.rung) == (ExitCode.ENDED_BY_OPERATOR, Rung.LAND)

@@ -63,7 +63,7 @@ class Flown:
             self.lab.clock.at(self.lab.now + period, visit)
 
         def hear(message):
-            self.armed = self.armed or self.lab.vehicle.supervisor.armed
+            self.armed = self.armed or self.lab.vehicle.firmware.supervisor.armed
             if isinstance(message, PhaseEntered):
                 self.phases.append(message.phase)
                 if guest and message.phase is phase:
@@ -114,7 +114,7 @@ def test_what_is_set_flies_whatever_it_was_before(mission, rule):
     unwatched = replace(LIMITS, firmware=replace(LIMITS.firmware, watchdog=False))
     flown = Flown(replace(mission, limits=unwatched), stored={rule.name: wrong_on_board(rule, LIMITS)})
     assert flown.code is ExitCode.OK, flown.reason
-    assert flown.lab.vehicle.parameters[rule.name] == pytest.approx(rule.value(LIMITS))
+    assert flown.lab.vehicle.firmware.parameters[rule.name] == pytest.approx(rule.value(LIMITS))
 
 
 @pytest.mark.parametrize(
@@ -141,16 +141,16 @@ def test_a_motor_test_that_starts_after_preflight_is_ended_and_the_vehicle_lands
         assert flown.code is ExitCode.ENDED_BY_SAFETY
         assert "a motor test is on" in flown.reason
     assert (Phase.LAND in flown.phases) == (phase is not Phase.ARM)
-    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
-    assert not flown.lab.vehicle.supervisor.crashed
+    assert flown.lab.vehicle.firmware.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.firmware.supervisor.crashed
 
 
 def test_a_cut_stops_the_motors_of_a_vehicle_under_a_motor_test(mission):
     flown = Flown(mission, MOTOR_TEST, Phase.STREAM, period=ONCE, order=Order.CUT)
     assert flown.code is ExitCode.ENDED_BY_OPERATOR
-    assert flown.lab.vehicle.supervisor.locked
-    assert flown.lab.vehicle.parameters["motorPowerSet.enable"] == 0
-    assert not flown.lab.vehicle.stabilizer.loop.motors.any()
+    assert flown.lab.vehicle.firmware.supervisor.locked
+    assert flown.lab.vehicle.firmware.parameters["motorPowerSet.enable"] == 0
+    assert not flown.lab.vehicle.motors.any()
 
 
 @pytest.mark.parametrize("guest", [HOVER_HERE, ZERO_ATTITUDE])
@@ -160,7 +160,7 @@ def test_one_that_an_unarmed_vehicle_does_not_obey_is_heard_before_take_off(miss
     assert "the controller has a setpoint" in flown.reason
     assert Phase.TAKE_OFF not in flown.phases
     flown.lab.clock.sleep(0.2)
-    assert not flown.lab.vehicle.supervisor.armed
+    assert not flown.lab.vehicle.firmware.supervisor.armed
 
 
 def test_before_2026_08_a_joystick_at_rest_is_heard_only_by_what_it_does(mission):
@@ -199,4 +199,4 @@ def test_gains_that_may_fly_fly_what_the_dry_run_flew():
 
 def test_a_vehicle_that_refused_stays_unlocked(mission):
     flown = Flown(mission, stored={"colAv.enable": 1})
-    assert flown.lab.vehicle.supervisor.state is not State.LOCKED
+    assert flown.lab.vehicle.firmware.supervisor.state is not State.LOCKED

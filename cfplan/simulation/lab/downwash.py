@@ -36,7 +36,7 @@ def share_air(vehicles: Sequence[VirtualCrazyflie]) -> None:
 
     A vehicle pushes air down as its motors push it up, so one that stands with its motors off disturbs nobody.
     """
-    states = [vehicle.stabilizer.loop.truth[:17].tolist() for vehicle in vehicles]
+    states = [vehicle.truth.tolist() for vehicle in vehicles]
     thrusts = [sum(state[13:17]) for state in states]
     for vehicle, own, thrust in zip(vehicles, states, thrusts, strict=True):
         pushed = sum(

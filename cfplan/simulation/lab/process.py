@@ -9,6 +9,7 @@ import struct
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -20,10 +21,11 @@ from cfplan.flight.real_time import lock_memory
 from cfplan.simulation.lab.downwash import share_air
 from cfplan.simulation.lab.lab import CLOSE, LATEST, MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPERVISOR, TIME
 from cfplan.simulation.lab.radio import Radio, RadioFault
+from cfplan.simulation.virtual_crazyflie.defaults import KALMAN
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
-from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.virtual_firmware import COMMANDER_PERIOD, VirtualFirmware
 from cfplan.simulation.virtual_vicon.cameras import Cameras
 from cfplan.simulation.virtual_vicon.faults import Seen, ViconFault
 from cfplan.simulation.virtual_vicon.vicon import VirtualVicon
@@ -50,9 +52,9 @@ class Recorder:
         """Write a row."""
         if self._count == len(self._rows):
             self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
-        row, loop = self._rows[self._count], vehicle.stabilizer.loop
-        row[TIME], row[STATE], row[MOTORS] = time, loop.truth, loop.motors
-        row[OFF_IN_AIR], row[SUPERVISOR] = loop.counts[OFF_IN_AIR_TICKS], vehicle.supervisor.state
+        row = self._rows[self._count]
+        row[TIME], row[STATE], row[MOTORS] = time, vehicle.truth, vehicle.motors
+        row[OFF_IN_AIR], row[SUPERVISOR] = vehicle.off_in_air, vehicle.supervisor_state
         self._count += 1
 
     def rows(self, first: int = 0) -> bytes:
@@ -74,11 +76,13 @@ class LabLoop:
     ):
         self.companions: Mapping[str, LabLoop] = {}  # by the names that the cameras have for them
         self.cameras: Cameras | None = None  # a VirtualVicon serves their pictures; others go on board
+        if on_board:  # the filter that takes poses, as a positioning deck has it chosen at each start
+            vehicle = replace(vehicle, stored={"stabilizer.estimator": KALMAN, **vehicle.stored})
         self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        # ms between the moments at which it may send by itself; another firmware may do so at any
+        self._sends = COMMANDER_PERIOD if isinstance(self.vehicle.firmware, VirtualFirmware) else 1
         self._clock = clock
         self._seed = vehicle.seed
-        if on_board:
-            self.vehicle.use_kalman()
         self._warm_up()
         self.record = Recorder()
         self.link = _socket_at(port)
@@ -127,7 +131,7 @@ class LabLoop:
         tick = self.vehicle.tick
         if self._radio is not None and self._radio.busy:
             return self._origin + (tick + 1) / 1000
-        boundary = -(-tick // COMMANDER_PERIOD) * COMMANDER_PERIOD
+        boundary = -(-tick // self._sends) * self._sends
         after = min(boundary, self._next_look()) + 1
         return min(self._origin + after / 1000, self.cameras.next_due if self.cameras is not None else math.inf)
 
@@ -148,7 +152,7 @@ class LabLoop:
         """Return where the vehicle is at a time, s, to which it is advanced where that is due."""
         if not math.isnan(self._origin):
             self._run_to(int((now - self._origin) * 1000))
-        truth = self.vehicle.stabilizer.loop.truth.tolist()
+        truth = self.vehicle.truth.tolist()
         return (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9])
 
     def _run_to(self, target: int) -> None:
@@ -165,7 +169,7 @@ class LabLoop:
     def _look(self, now: float) -> None:
         """Let the cameras see the vehicles when it is due."""
         if self.cameras is not None and now >= self.cameras.next_look:
-            truth = self.vehicle.stabilizer.loop.truth.tolist()
+            truth = self.vehicle.truth.tolist()
             others = {name: loop.pose_at(now) for name, loop in self.companions.items()}
             self.cameras.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]), others)
 
@@ -218,7 +222,7 @@ class LabLoop:
         if isinstance(request, tuple):
             what, number = request
             loop = self.loops[number]
-            control.send((loop.record.rows(-1 if what == LATEST else 0), loop.vehicle.supervisor.ever_locked))
+            control.send((loop.record.rows(-1 if what == LATEST else 0), loop.vehicle.locked))
         elif isinstance(request, ViconFault) and self.cameras is not None:
             self.cameras.inject(request, self._clock.now())
         elif isinstance(request, VehicleFault):

@@ -134,7 +134,7 @@ class VehicleLab(SteppedLab):
         raise PilotDied
 
     def _body_seen(self) -> Seen:
-        truth = self.body.vehicle.stabilizer.loop.truth.tolist()
+        truth = self.body.vehicle.truth.tolist()
         return (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9])
 
 
@@ -213,7 +213,7 @@ class SteppedFleet:
                 lab.clock.sleep(PERIOD)
             lab.clock.sleep(_SETTLING)
             until = lab.now + _AFTERWARDS
-            while lab.vehicle.supervisor.state in _FLYING and lab.now < until:
+            while lab.vehicle.supervisor_state in _FLYING and lab.now < until:
                 lab.clock.sleep(PERIOD)
 
         return act

@@ -14,8 +14,7 @@ from cfplan.simulation.lab.lab import MOTORS, OFF_IN_AIR, ROW_SIZE, STATE, SUPER
 from cfplan.simulation.lab.radio import Radio, RadioFault
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
-from cfplan.simulation.virtual_crazyflie.vehicle import COMMANDER_PERIOD, VirtualCrazyflie
+from cfplan.simulation.virtual_crazyflie.vehicle import PERIOD, VirtualCrazyflie
 from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_vicon.server import Picture
 from cfplan.vehicle.airframe import Airframe
@@ -35,15 +34,14 @@ class SteppedLab:
         cameras: ViconSettings | None = None,
         seed: int = 0,
     ):
-        self._vehicle = VirtualCrazyflie(airframe, vehicle)
-        self._vehicle.advance(_WARM_UP)
-        self._vehicle.sent()
-        self._tick = self._vehicle.tick  # of now; the vehicle is advanced to it when something acts on it or sees it
+        self.vehicle = VirtualCrazyflie(airframe, vehicle)
+        self.vehicle.advance(_WARM_UP)
+        self.vehicle.sent()
         self.clock = SteppedClock(BEGIN, self._advance)
         self.radio = Radio(BEGIN, seed=11 + seed)
         self.cameras = Cameras(cameras or ViconSettings(seed=7 + seed), BEGIN)
         self.heard: Callable[[bytes], None] = lambda _: None
-        self._origin = BEGIN - self._tick / 1000
+        self._origin = BEGIN - self.vehicle.tick / 1000
         self._pictures: list[tuple[float, Picture]] = []
         self._connected_from = BEGIN
         self._rows: list[np.ndarray] = []
@@ -52,14 +50,6 @@ class SteppedLab:
     def now(self) -> float:
         """Return the time, s."""
         return self.clock.now()
-
-    @property
-    def vehicle(self) -> VirtualCrazyflie:
-        """Return the vehicle as it is now."""
-        behind = self._tick - self._vehicle.tick
-        if behind > 0:
-            self._vehicle.advance(behind)
-        return self._vehicle
 
     def disturb(self, fault: Fault) -> None:
         """Let something go wrong; its start counts from now."""
@@ -78,27 +68,32 @@ class SteppedLab:
     def truth(self) -> Truth:
         """Return the truth so far."""
         rows = np.array(self._rows).reshape(-1, ROW_SIZE)
-        return Truth.of(rows, self.vehicle.supervisor.ever_locked)
+        return Truth.of(rows, self.vehicle.locked)
 
     def _advance(self, end: float) -> None:
         """Advance the lab by milliseconds, from one event to the next."""
         target = int((end - self._origin) * 1000 + 1e-6)
-        while (tick := self._tick) < target:
+        while (tick := self.vehicle.tick) < target:
             self.clock.reach(self._origin + tick / 1000)
-            now, passed = self.clock.now(), tick % COMMANDER_PERIOD
+            now, passed = self.clock.now(), tick % PERIOD
             self._exchange(now)
             self._look(now)
             if not passed:
                 self._note()
-                self.vehicle.command()
-                self._answer()
             # At a boundary the vehicle may send logs, which leave within a millisecond, as a real one's do.
             if not passed or self.radio.busy:
-                self._tick += 1
+                self._run_to(tick + 1)
             else:
-                self._tick = max(min(target, tick + COMMANDER_PERIOD - passed, self._next_sight()), tick + 1)
+                self._run_to(max(min(target, tick + PERIOD - passed, self._next_sight()), tick + 1))
         self.clock.reach(end)
         self._exchange(self.clock.now())
+
+    def _run_to(self, tick: int) -> None:
+        """Advance the vehicle to a tick, or to the end of an earlier one in which it sends."""
+        while self.vehicle.tick < tick:
+            self.vehicle.step()
+            if self._answer():
+                return
 
     def _next_sight(self) -> int:
         """Return the tick at which the cameras look or a picture leaves next."""
@@ -114,16 +109,19 @@ class SteppedLab:
         for packet in down:
             self.heard(packet)
 
-    def _answer(self) -> None:
-        for packet in self._vehicle.sent():
+    def _answer(self) -> bool:
+        """Give the radio what the vehicle sends; return whether there was anything."""
+        packets = self.vehicle.sent()
+        for packet in packets:
             self.radio.answer(packet)
+        return bool(packets)
 
     def _look(self, now: float) -> None:
         cameras = self.cameras
         if now < cameras.next_look - 1e-6 and now < cameras.next_due and not cameras.disturbed:
             return
         if now >= cameras.next_look - 1e-6:
-            truth = self.vehicle.stabilizer.loop.truth.tolist()
+            truth = self.vehicle.truth.tolist()
             cameras.look(now, (truth[0], truth[1], truth[2]), (truth[6], truth[7], truth[8], truth[9]))
         due = cameras.due(now) if cameras.next_due <= now else ()
         if cameras.cut_off(now):
@@ -132,7 +130,7 @@ class SteppedLab:
             self._pictures += [(now, picture) for picture in due]
 
     def _note(self) -> None:
-        row, loop = np.empty(ROW_SIZE), self.vehicle.stabilizer.loop
-        row[TIME], row[STATE], row[MOTORS] = self.now, loop.truth, loop.motors
-        row[OFF_IN_AIR], row[SUPERVISOR] = loop.counts[OFF_IN_AIR_TICKS], self.vehicle.supervisor.state
+        row, vehicle = np.empty(ROW_SIZE), self.vehicle
+        row[TIME], row[STATE], row[MOTORS] = self.now, vehicle.truth, vehicle.motors
+        row[OFF_IN_AIR], row[SUPERVISOR] = vehicle.off_in_air, vehicle.supervisor_state
         self._rows.append(row)

@@ -17,6 +17,7 @@ from cfplan.flight.radio.transport import Fail, Hear
 from cfplan.flight.telemetry import Telemetry
 from cfplan.safety.limits import PoseLimits
 from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.virtual_crazyflie.virtual_firmware import tables as virtual_tables
 
 URI = "stepped://0"
 _STEP = 0.001  # s
@@ -51,19 +52,20 @@ class SteppedTransport:
 def connect(lab: SteppedLab, report: Callable[[Telemetry], None], tables: TableCache | None = None) -> Link:
     """Connect, as `cfplan.flight.radio.connection.connect` does.
 
-    `tables` are those known beforehand; by default the vehicle's own, so that each connection takes the same time.
+    `tables` are those known beforehand; by default those of cfplan's own firmware, so that each connection to it takes
+    the same time.
     """
     transport = SteppedTransport(lab)
     session = Session(transport, URI, lab.clock)
-    session.open(FIRST_ANSWER_TIMEOUT, _vehicles_tables(lab) if tables is None else tables)
+    session.open(FIRST_ANSWER_TIMEOUT, _known_tables(lab) if tables is None else tables)
     link = Link(session, report, transport.restart)
     link.release_priority()
     return link
 
 
-def _vehicles_tables(lab: SteppedLab) -> TableCache:
+def _known_tables(lab: SteppedLab) -> TableCache:
     tables = TableCache()
-    for port, toc in ((Port.LOG, lab.vehicle.log.toc), (Port.PARAMETERS, lab.vehicle.parameters.toc)):
+    for port, toc in virtual_tables(lab.vehicle.settings).items():
         entries = enumerate(toc.variables)
         tables.add(port, toc.checksum, {entry.full_name: (number, entry.code) for number, entry in entries})
     return tables

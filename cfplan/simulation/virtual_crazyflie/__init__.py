@@ -1,3 +1,3 @@
 """A simulated Crazyflie that speaks CRTP to an unmodified cflib."""
 
-__all__ = ["faults", "log_variables", "settings", "stabilizer", "supervisor", "vehicle"]
+__all__ = ["defaults", "faults", "firmware", "settings", "supervisor", "vehicle", "virtual_firmware"]

@@ -3,7 +3,7 @@
 Zhou, Wang, Bandyopadhyay and Schwager, "Fast, on-line collision avoidance for dynamic vehicles using buffered Voronoi
 cells" (2017). Without neighbours the cell is a box about the vehicle: as far as it may go at `maxSpeed` within
 `horizon`, cut by the bounding box. Place and velocity of a setpoint are moved into that cell; acceleration and body
-rates stay as they were sent. The firmware does so every millisecond, this once in ten.
+rates stay as they were sent.
 """
 
 from dataclasses import dataclass, field

@@ -27,6 +27,7 @@ SILENCED: Mapping[StrEnum, str] = {
     VehicleFaultKind.SILENT_ESTIMATE: "stateEstimateZ.x",
     VehicleFaultKind.SILENT_STATUS: "supervisor.info",
 }
+FIRMWARE_FAULTS = frozenset((VehicleFaultKind.LOCK, VehicleFaultKind.DECK, *SILENCED))  # others are of body or battery
 
 
 @dataclass(frozen=True, slots=True)

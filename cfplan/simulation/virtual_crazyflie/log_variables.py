@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from cfplan.flight.setpoints.packets import compress_quaternion
 from cfplan.machine_code import njit
 from cfplan.simulation.engine.kalman import Filter
-from cfplan.simulation.virtual_crazyflie.battery import Battery
 from cfplan.simulation.virtual_crazyflie.localization import Localization
 from cfplan.simulation.virtual_crazyflie.setpoints import PITCH, ROLL, YAW, Setpoint
 from cfplan.simulation.virtual_crazyflie.stabilizer import Loop
@@ -39,14 +38,15 @@ def log_variables(
     *,
     localization: Localization,
     supervisor: Supervisor,
-    battery: Battery,
+    voltage: Callable[[], float],
     airframe: Airframe,
     setpoint: Callable[[], Setpoint],
     info: Callable[[], int],
 ) -> Mapping[str, Getter]:
     """Return a function for each log variable that has a value; the others stay zero.
 
-    `setpoint` returns what the controller is given now, `info` the bits of supervisor.info.
+    `voltage` returns that of the battery, V, `setpoint` what the controller is given now, `info` the bits of
+    supervisor.info.
     """
     belief, kalman = loop.belief, loop.kalman
     found: dict[str, Getter] = {}
@@ -65,7 +65,7 @@ def log_variables(
     for place, name in enumerate("xyzw"):
         found[f"locSrv.q{name}"] = _element(localization.latest, 3 + place)
     found |= _variances(kalman) | _attitude(belief) | _accelerations(loop) | _targets(setpoint)
-    found |= _motors(loop, battery, airframe) | _power(battery)
+    found |= _motors(loop, voltage, airframe) | _power(voltage)
     found["supervisor.info"] = info
     found["sys.canfly"] = lambda: supervisor.can_fly
     found["sys.isFlying"] = lambda: supervisor.is_flying
@@ -137,9 +137,9 @@ def _targets(setpoint: Callable[[], Setpoint]) -> dict[str, Getter]:
     return found
 
 
-def _motors(loop: Loop, battery: Battery, airframe: Airframe) -> dict[str, Getter]:
+def _motors(loop: Loop, voltage: Callable[[], float], airframe: Airframe) -> dict[str, Getter]:
     def pwm(place: int) -> Getter:
-        return lambda: compensated_pwm(float(loop.motors[place]) / FULL_COMMAND, battery.voltage, airframe)
+        return lambda: compensated_pwm(float(loop.motors[place]) / FULL_COMMAND, voltage(), airframe)
 
     found: dict[str, Getter] = {f"motor.m{place + 1}": pwm(place) for place in range(4)}
     for place, name in enumerate(("thrust", "roll", "pitch", "yaw")):
@@ -149,10 +149,10 @@ def _motors(loop: Loop, battery: Battery, airframe: Airframe) -> dict[str, Gette
     return found
 
 
-def _power(battery: Battery) -> dict[str, Getter]:
+def _power(voltage: Callable[[], float]) -> dict[str, Getter]:
     empty, full = _BATTERY_LEVELS
     return {
-        "pm.vbat": lambda: battery.voltage,
-        "pm.vbatMV": lambda: battery.voltage * 1000,
-        "pm.batteryLevel": lambda: float(np.clip(100 * (battery.voltage - empty) / (full - empty), 0, 100)),
+        "pm.vbat": voltage,
+        "pm.vbatMV": lambda: voltage() * 1000,
+        "pm.batteryLevel": lambda: float(np.clip(100 * (voltage() - empty) / (full - empty), 0, 100)),
     }

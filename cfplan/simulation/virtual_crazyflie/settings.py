@@ -1,10 +1,15 @@
 """Settings of a virtual Crazyflie: its sensors, firmware and state at start."""
 
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from cfplan.simulation.virtual_crazyflie.battery import CAPACITY
+from cfplan.simulation.virtual_crazyflie.firmware import Firmware
 from cfplan.simulation.virtual_crazyflie.services import FIRMWARE_VERSION, PROTOCOL_VERSION
+from cfplan.vehicle.airframe import Airframe
+
+FirmwareFactory = Callable[[Airframe, "VehicleSettings"], Firmware]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +31,11 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """How the vehicle is when it is switched on."""
+    """How the vehicle is when it is switched on.
+
+    A firmware other than cfplan's own need not heed `auto_arming`, `protocol`, `firmware`, `stored`, `stubborn` and
+    `parameter_delay`.
+    """
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)  # m; its height is that of the floor
     yaw: float = 0.0  # rad
@@ -41,3 +50,9 @@ class VehicleSettings:
     stored: Mapping[str, float] = field(default_factory=dict)  # parameters that it has other values of than the usual
     stubborn: tuple[str, ...] = ()  # parameters that writing does not change
     parameter_delay: float = 0.0  # s until it answers a write
+    make_firmware: FirmwareFactory | None = None  # None: as CFPLAN_FIRMWARE says, else cfplan's own
+
+    @property
+    def version(self) -> tuple[int, ...]:
+        """Return the firmware's version."""
+        return tuple(int(part) for part in re.findall(r"\d+", self.firmware))

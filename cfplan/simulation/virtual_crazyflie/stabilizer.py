@@ -1,7 +1,4 @@
-"""The stabilizer, compiled: sensors and body at 1 kHz, controller at 500 Hz on the estimate.
-
-Nothing but the sensors and the recorder sees the true state; the controller flies on what the filter believes.
-"""
+"""The firmware's stabilizer, compiled: filter at 1 kHz, controller at 500 Hz on the estimate."""
 
 from typing import NamedTuple
 
@@ -10,27 +7,11 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
-from cfplan.simulation.engine.body import TIME_STEP, step_and_feel
 from cfplan.simulation.engine.kalman import Filter, estimate, reset, step_filter
-from cfplan.simulation.engine.layout import (
-    AIRFRAME,
-    ASKED,
-    EFFICIENCY,
-    FLOOR,
-    MEMORY,
-    MEMORY_SIZE,
-    SETPOINT,
-    SETPOINT_SIZE,
-    STATE_SIZE,
-    VEHICLE_SIZE,
-    WIND,
-    at_rest,
-    pack_airframe,
-)
+from cfplan.simulation.engine.layout import MEMORY, MEMORY_SIZE, SETPOINT, SETPOINT_SIZE
 from cfplan.simulation.engine.mellinger import (
     CONTROL_PERIOD,
     DISABLE,
-    FULL_COMMAND,
     MODE_Z,
     level_out,
     mixed,
@@ -38,31 +19,23 @@ from cfplan.simulation.engine.mellinger import (
 )
 from cfplan.simulation.engine.pid import OUTPUT_LIMIT, OVERHEAD, default_gains, default_limits, step_pid
 from cfplan.simulation.virtual_crazyflie.setpoints import THRUST, Setpoint
-from cfplan.simulation.virtual_crazyflie.settings import Sensors, VehicleSettings
-from cfplan.vehicle.airframe import GRAVITY, Airframe
+from cfplan.vehicle.airframe import GRAVITY
 
-# Indices in the array of integers: counts, the setpoint's modes, and the inputs of the next run.
-OFF_TICKS, OFF_IN_AIR_TICKS, RESETS = range(3)
-_MODE, _IN_BODY, _ALLOWED, _FLYING, _ASKED, _MELLINGER, _NUMBERS = 3, 10, 11, 12, 13, 14, 15
-
-IN_AIR = 0.05  # m above the floor; a landing ends a little above it
-_NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it has no common period with anything
+# Indices in the array of integers: the setpoint's modes, and the switches.
+_MODE, _IN_BODY, _ALLOWED, _FLYING, _ASKED, _MELLINGER, _NUMBERS = 0, 7, 8, 9, 10, 11, 12
+_CONTROLLER_SIZE = SETPOINT + SETPOINT_SIZE
 
 
 class Loop(NamedTuple):
-    """Everything that the compiled loop reads and changes, in place: views of one array of numbers, but for noise and
-    whole numbers.
+    """Everything that the compiled loop reads and changes, in place: views of one array of numbers, but for whole ones.
 
     To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
     """
 
-    vehicle: NDArray  # (77,) as in `engine.layout`: body, Mellinger controller, setpoint, airframe
-    truth: NDArray  # (17,) of that the body's state
-    wind: NDArray  # (3,) m/s, of that
-    efficiency: NDArray  # (4,) fraction of its thrust that each motor gives, of that
+    controller: NDArray  # (51,) as in `engine.layout`, of which it uses the Mellinger controller and the setpoint
     kalman: Filter
     belief: NDArray  # (13,) estimated position, velocity, quaternion; body rate as measured
-    acceleration: NDArray  # (3,) m/s², specific force as measured, body axes
+    acceleration: NDArray  # (3,) m/s², specific force as measured, without vibration, body axes
     pid_memory: NDArray  # (36,) of the PID controller
     control: NDArray  # (4,)
     motors: NDArray  # (4,) 16-bit commands
@@ -72,22 +45,18 @@ class Loop(NamedTuple):
     gains: NDArray  # (19,) of the Mellinger controller, see `mellinger`
     pid_gains: NDArray  # (12, 5) see `pid`
     pid_limits: NDArray  # (5,)
-    counts: NDArray  # (15,) int: OFF_TICKS, OFF_IN_AIR_TICKS, RESETS, and the inputs of the next run
-    noise: NDArray  # (8191, 6) gyroscope rad/s, accelerometer m/s², biases included
+    switches: NDArray  # (12,) int: the setpoint's modes, and the other inputs of the next run
 
 
-_FLOATS = VEHICLE_SIZE + 271  # of all parts together
+_FLOATS = _CONTROLLER_SIZE + 271  # of all parts together
 
 
 @register_jitable
-def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
+def _parts(floats: NDArray, switches: NDArray) -> Loop:
     """Return the parts of the array in their order."""
-    more = floats[VEHICLE_SIZE:]
+    more = floats[_CONTROLLER_SIZE:]
     return Loop(
-        vehicle=floats[:VEHICLE_SIZE],
-        truth=floats[:STATE_SIZE],
-        wind=floats[WIND : WIND + 3],
-        efficiency=floats[EFFICIENCY : EFFICIENCY + 4],
+        controller=floats[:_CONTROLLER_SIZE],
         kalman=Filter(more[0:9], more[9:13], more[13:94].reshape(9, 9), more[94:101], more[101:105]),
         belief=more[105:118],
         acceleration=more[118:121],
@@ -100,32 +69,28 @@ def _parts(floats: NDArray, counts: NDArray, noise: NDArray) -> Loop:
         gains=more[187:206],
         pid_gains=more[206:266].reshape(12, 5),
         pid_limits=more[266:271],
-        counts=counts,
-        noise=noise,
+        switches=switches,
     )
 
 
 class Stabilizer:
-    """The vehicle below the commander. `prior` (16,) and `gains` (19,) are those of the filter and the controller."""
+    """The firmware below the commander. `prior` (16,) and `gains` (19,) are those of the filter and the controller."""
 
-    def __init__(self, airframe: Airframe, settings: VehicleSettings, prior: NDArray, gains: NDArray):
-        position = np.array(settings.position, dtype=float)
-        self._floats, self._counts = np.zeros(_FLOATS), np.zeros(_NUMBERS, dtype=np.int64)
-        self._noise = _sensor_noise(settings.sensors, settings.seed)
-        self.loop = loop = _parts(self._floats, self._counts, self._noise)
-        loop.truth[:] = at_rest(position, settings.yaw)
+    def __init__(self, prior: NDArray, gains: NDArray):
+        self._floats, self._switches = np.zeros(_FLOATS), np.zeros(_NUMBERS, dtype=np.int64)
+        self.loop = loop = _parts(self._floats, self._switches)
         loop.acceleration[:] = 0.0, 0.0, GRAVITY
-        loop.vehicle[AIRFRAME:] = pack_airframe(airframe, floor=float(position[2]))
         loop.prior[:], loop.gains[:] = prior, gains
         loop.pid_gains[:], loop.pid_limits[:] = default_gains(), default_limits()
         self.mellinger = False  # which of the two controllers flies
-        self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
+        self._setpoint: Setpoint | None = None
+        self._inputs: tuple[bool, ...] = ()  # with the setpoint, of the last run
         reset(loop.kalman, loop.prior)
         estimate(loop.kalman, loop.belief)
 
     def reset_controller(self) -> None:
         """Clear the integrals, as the choice of another controller does."""
-        self.loop.vehicle[MEMORY : MEMORY + MEMORY_SIZE] = 0.0
+        self.loop.controller[MEMORY : MEMORY + MEMORY_SIZE] = 0.0
         self.loop.pid_memory[:] = 0.0
 
     def limit_speed(self, axis: int, most: float) -> None:
@@ -136,59 +101,51 @@ class Stabilizer:
         """Reset the filter to the place that its parameters name."""
         reset(self.loop.kalman, self.loop.prior)
 
-    def run(
-        self, tick: int, ticks: int, setpoint: Setpoint, poses: NDArray, *, allowed: bool, level: bool, flying: bool
-    ) -> None:
-        """Advance from `tick` by `ticks` of 1 ms; `poses` (n, 9) as in `kalman`."""
-        values, mode = self.loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE], self._counts[_MODE:_IN_BODY]
+    def set(self, setpoint: Setpoint, *, allowed: bool, level: bool, flying: bool) -> None:
+        """Set the inputs of the runs that follow."""
+        inputs = allowed, level, flying, self.mellinger
+        if setpoint is self._setpoint and inputs == self._inputs:
+            return
+        self._setpoint, self._inputs = setpoint, inputs
+        values, mode = self.loop.controller[SETPOINT:], self._switches[_MODE:_IN_BODY]
         values[:], mode[:] = setpoint.values, setpoint.mode
         if level:
             level_out(values, mode)
         asked = allowed and bool(mode[MODE_Z] != DISABLE or values[THRUST] > 0)
-        self._counts[_IN_BODY:] = setpoint.velocity_in_body, allowed, flying, asked, self.mellinger
-        _run(self._floats, self._counts, self._noise, poses, tick, ticks, self._per_command)
+        self._switches[_IN_BODY:] = setpoint.velocity_in_body, allowed, flying, asked, self.mellinger
 
+    def run(self, tick: int, gyroscope: NDArray, accelerometer: NDArray, poses: NDArray) -> NDArray | None:
+        """Run for the millisecond `tick`; return the motors' commands, (4,) 16 bits, None if nothing asks for any.
 
-def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
-    chance = np.random.default_rng(seed)
-    noise = np.empty((_NOISE_ROWS, 6))
-    noise[:, :3] = chance.normal(chance.normal(0.0, sensors.gyro_bias, 3), sensors.gyro_noise, (_NOISE_ROWS, 3))
-    noise[:, 3:] = chance.normal(
-        chance.normal(0.0, sensors.acceleration_bias), sensors.acceleration_noise, (_NOISE_ROWS, 3)
-    )
-    return noise
+        `gyroscope` (3,) rad/s and `accelerometer` (3,) m/s² as measured; `poses` (n, 9) as in `kalman`.
+        """
+        turn = _run(self._floats, self._switches, gyroscope, accelerometer, poses, tick)
+        return self.loop.motors if turn else None
 
 
 @njit(error_model="numpy")
 def _run(
-    floats: NDArray, counts: NDArray, noise: NDArray, poses: NDArray, tick: int, ticks: int, per_command: float
-) -> None:  # seven, as numba knows no objects
-    loop = _parts(floats, counts, noise)
-    gyro, measured = np.empty(3), np.empty(3)
-    none, flying = poses[:0], loop.counts[_FLYING] != 0
-    for now in range(tick, tick + ticks):
-        row = now % len(loop.noise)
-        for axis in range(3):
-            gyro[axis] = loop.truth[10 + axis] + loop.noise[row, axis]
-            measured[axis] = loop.acceleration[axis] + loop.noise[row, 3 + axis]
-            loop.belief[10 + axis] = gyro[axis]
-        if not step_filter(loop.kalman, loop.prior, gyro, measured, poses if now == tick else none, now, flying):
-            loop.counts[RESETS] += 1
-        estimate(loop.kalman, loop.belief)
-        if now % 2 == 0:
-            _control(loop, now)
-        _drive(loop, per_command)
+    floats: NDArray, switches: NDArray, gyroscope: NDArray, accelerometer: NDArray, poses: NDArray, tick: int
+) -> bool:
+    """Step filter and controller; return whether any motor turns, or is asked to."""
+    loop = _parts(floats, switches)
+    loop.belief[10:13] = gyroscope
+    step_filter(loop.kalman, loop.prior, gyroscope, accelerometer, poses, tick, loop.switches[_FLYING] != 0)
+    estimate(loop.kalman, loop.belief)
+    if tick % 2 == 0:
+        _control(loop, tick)
+    return _drive(loop)
 
 
 @register_jitable
 def _control(loop: Loop, now: int) -> None:
     """Step the active controller on the filter's estimate."""
-    mode = loop.counts[_MODE:_IN_BODY]
-    if loop.counts[_MELLINGER]:
-        control = step_mellinger(loop.vehicle, loop.gains, mode, loop.belief, CONTROL_PERIOD)
+    mode = loop.switches[_MODE:_IN_BODY]
+    if loop.switches[_MELLINGER]:
+        control = step_mellinger(loop.controller, loop.gains, mode, loop.belief, CONTROL_PERIOD)
         loop.control[0], loop.control[1], loop.control[2], loop.control[3] = control
     else:
-        setpoint, in_body = loop.vehicle[SETPOINT : SETPOINT + SETPOINT_SIZE], loop.counts[_IN_BODY] != 0
+        setpoint, in_body = loop.controller[SETPOINT : SETPOINT + SETPOINT_SIZE], loop.switches[_IN_BODY] != 0
         step_pid(
             loop.control, loop.pid_memory, loop.pid_gains, loop.pid_limits, setpoint, mode, in_body, loop.belief, now
         )  # fmt: skip
@@ -196,13 +153,13 @@ def _control(loop: Loop, now: int) -> None:
     loop.motors[0], loop.motors[1], loop.motors[2], loop.motors[3] = commands
 
 
-@njit(allocates=False)
-def _drive(loop: Loop, per_command: float) -> None:
-    """Turn the motors, move the body, and note what its accelerometer measures.
+@register_jitable
+def _drive(loop: Loop) -> bool:
+    """Command the motors; return whether any turns, or is asked to.
 
     Motors count as off if nothing asks them to turn, not if the controller wants no thrust for a moment.
     """
-    off, allowed, vehicle = True, loop.counts[_ALLOWED] != 0, loop.vehicle
+    turn, allowed = loop.switches[_ASKED] != 0, loop.switches[_ALLOWED] != 0
     for motor in range(4):
         if allowed and not loop.motors[motor] > loop.idle[0]:
             loop.motors[motor] = loop.idle[0]
@@ -210,10 +167,5 @@ def _drive(loop: Loop, per_command: float) -> None:
             loop.motors[motor] = 0.0
         if loop.override[0] > 0.0:  # by the motor driver: also where the supervisor lets no motor turn
             loop.motors[motor] = loop.override[1 + motor if loop.override[0] == 1.0 else 1]
-        off = off and loop.motors[motor] == 0.0
-        vehicle[ASKED + motor] = loop.motors[motor] * per_command
-    if off and loop.counts[_ASKED] == 0:
-        loop.counts[OFF_TICKS] += 1
-        if vehicle[2] > vehicle[FLOOR] + IN_AIR:
-            loop.counts[OFF_IN_AIR_TICKS] += 1
-    step_and_feel(vehicle, TIME_STEP, loop.acceleration)
+        turn = turn or loop.motors[motor] != 0.0
+    return turn

@@ -1,141 +1,96 @@
-"""The virtual Crazyflie: it takes packets, advances by milliseconds when told to, and returns packets."""
+"""The virtual Crazyflie: body, sensors, battery and the radio's processor of a vehicle, around its firmware.
 
-import math
-import re
-from functools import partial
+Nothing but the sensors and the recorder sees the true state; the firmware flies on what it measures and is sent.
+"""
+
+import os
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.flight.firmware import GAIN_PARAMETERS, YAW_CORRECT, Timeouts
-from cfplan.flight.radio.crtp import LARGEST_PAYLOAD, Port, pack
+from cfplan.errors import InputError
+from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.restart import POWER, POWER_CHANNEL, SYSTEM_OFF, SYSTEM_ON
-from cfplan.simulation.engine.layout import MASS, MOTORS, THRUST_MAX
-from cfplan.simulation.virtual_crazyflie.battery import Battery
-from cfplan.simulation.virtual_crazyflie.catalogue import lacking
-from cfplan.simulation.virtual_crazyflie.collision_avoidance import CollisionAvoidance
-from cfplan.simulation.virtual_crazyflie.commander import Commander, Priority
-from cfplan.simulation.virtual_crazyflie.defaults import (
-    COMPLEMENTARY,
-    DEFAULTS,
-    KALMAN,
-    MELLINGER,
-    PID,
-    PID_GAIN_PARAMETERS,
-    PID_LIMIT_PARAMETERS,
-    PID_SPEED_PARAMETERS,
-    PRIOR_PARAMETERS,
+from cfplan.machine_code import njit
+from cfplan.simulation.engine.body import TIME_STEP, step_and_feel
+from cfplan.simulation.engine.layout import (
+    ASKED,
+    EFFICIENCY,
+    FLOOR,
+    MASS,
+    MOTORS,
+    STATE_SIZE,
+    THRUST_MAX,
+    WIND,
+    at_rest,
+    new_vehicle,
+    pack_airframe,
 )
-from cfplan.simulation.virtual_crazyflie.faults import SILENCED, VehicleFault, VehicleFaultKind
-from cfplan.simulation.virtual_crazyflie.high_level import Goal, HighLevelCommander, PlannerState
-from cfplan.simulation.virtual_crazyflie.localization import Localization
-from cfplan.simulation.virtual_crazyflie.log_blocks import DATA_CHANNEL, LogBlocks
-from cfplan.simulation.virtual_crazyflie.log_variables import log_variables
-from cfplan.simulation.virtual_crazyflie.parameters import Parameters
-from cfplan.simulation.virtual_crazyflie.services import Memories, answer_link, answer_platform
-from cfplan.simulation.virtual_crazyflie.setpoints import AttitudeSetpoints, FirmwareAssert, Setpoint, decode_setpoint
-from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.stabilizer import Stabilizer
-from cfplan.simulation.virtual_crazyflie.supervisor import PERIOD as SUPERVISOR_PERIOD
-from cfplan.simulation.virtual_crazyflie.supervisor import Supervisor
+from cfplan.simulation.virtual_crazyflie.battery import Battery
+from cfplan.simulation.virtual_crazyflie.faults import FIRMWARE_FAULTS, VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.firmware import FaultyFirmware
+from cfplan.simulation.virtual_crazyflie.settings import FirmwareFactory, Sensors, VehicleSettings
+from cfplan.simulation.virtual_crazyflie.supervisor import State
+from cfplan.simulation.virtual_crazyflie.virtual_firmware import VirtualFirmware
 from cfplan.vehicle.airframe import GRAVITY, Airframe
-from cfplan.vehicle.rotations import yaw_of
+from cfplan.vehicle.motor_commands import FULL_COMMAND
 
-COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
-_BOOT = 500  # ms from power on until it answers
-_CONNECTION_LASTS = round(1000 * Timeouts().connection)  # ms
-
-_SETPOINT_CHANNEL, _META_CHANNEL = 0, 1
-_NOTIFY_SETPOINT_STOP = 0
-_SUPERVISOR_INFO, _SUPERVISOR_COMMAND = 0, 1
-_ARM, _RECOVER, _EMERGENCY_STOP, _KEEP_ALIVE, _BITFIELD = 1, 2, 3, 4, 12
-_RESPONSE = 0x80
-_LEGACY_ARM, _LEGACY_RECOVER = 1, 2  # platform commands
-_NO_POSES = np.zeros((0, 9))
-_MOTORS_OFF = Setpoint()
-
-_SUPERVISOR_SINCE = 12  # protocol with which the port came
-_DECKS_SUPERVISED_SINCE = (2026, 8)  # firmware
+FIRMWARE_VARIABLE = "CFPLAN_FIRMWARE"
+PERIOD = 10  # ticks of 1 ms between updates of battery and faults
+IN_AIR = 0.05  # m above the floor; a landing ends a little above it
+_NOISE_ROWS = 8191  # ms after which the sensors' noise repeats; a prime, so that it has no common period with anything
 
 
 class VirtualCrazyflie:
-    """A vehicle of this airframe, switched on at tick 0."""
+    """A vehicle of this airframe, switched on at tick 0. Raises InputError if CFPLAN_FIRMWARE names no firmware."""
 
     def __init__(self, airframe: Airframe, settings: VehicleSettings | None = None):
-        self.settings = settings or VehicleSettings()
-        self.tick = 0
+        self.settings = settings = settings or VehicleSettings()
+        self.tick = 0  # ms
         self._airframe = airframe
-        self._version = tuple(int(part) for part in re.findall(r"\d+", self.settings.firmware))
+        position = np.array(settings.position, dtype=float)
+        self._body = new_vehicle(at_rest(position, settings.yaw), pack_airframe(airframe, floor=float(position[2])))
+        self.truth = self._body[:STATE_SIZE]  # (17,) as in `engine.layout`
+        self.wind = self._body[WIND : WIND + 3]  # (3,) m/s
+        self.efficiency = self._body[EFFICIENCY : EFFICIENCY + 4]  # (4,) fraction of its thrust that each motor gives
+        self.motors = np.zeros(4)  # commands, 16 bits
+        self.off_in_air = 0  # ms so far, in the air while nothing asked the motors to turn
+        self.noise = _sensor_noise(settings.sensors, settings.seed)  # (8191, 6) gyroscope rad/s, accelerometer m/s²
+        self._gyroscope, self._accelerometer, self._force = np.zeros(3), np.zeros(3), np.array((0.0, 0.0, GRAVITY))
+        self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
+        self.battery = Battery(settings.charge, settings.capacity)
         self._faults: list[tuple[int, float, VehicleFault]] = []  # with the ticks at which they begin and end
         self._thrust_left: float | None = None  # fraction that the wash of others leaves; None: nothing ever took any
-        self._estimator: int | None = None  # that a deck has chosen
-        self._runs_from: float = 0  # tick from which its processor listens and answers
-        self.battery = Battery(self.settings.charge, self.settings.capacity)
-        self._boot()
-
-    def _boot(self) -> None:
-        """Start the processor: everything is as after switching on."""
-        airframe, without = self._airframe, lacking(self._version)
-        self._commanded = -1  # the last tick at which the slower loops ran
-        self._heard = self.tick  # tick of the last packet
-        self._silent: tuple[str, ...] = ()  # variables whose log blocks are not sent
-        self.parameters = Parameters(DEFAULTS, without=without, stubborn=self.settings.stubborn)
-        self.stabilizer = Stabilizer(
-            airframe,
-            self.settings,
-            prior=np.array([0.0 if name in without else self.parameters[name] for name in PRIOR_PARAMETERS]),
-            gains=np.array([self.parameters[name] for name in GAIN_PARAMETERS]),
-        )
-        wanted = self.settings.auto_arming
-        auto_arming = "brushless" not in airframe.name if wanted is None else wanted
-        self.supervisor = Supervisor(auto_arming=auto_arming, say=self.say)
-        self.memories = Memories()
-        self.planner = HighLevelCommander(self.memories.trajectory, self._where)
-        self.commander = Commander(self.planner.stop)
-        self.localization = Localization()
-        self.setpoint = Setpoint()  # what the controller is given
-        self._attitude_setpoints = AttitudeSetpoints()
+        self._powered, self._powers_up = True, False
+        self._locked = False
         self._out: list[bytes] = []
-        # to writes of parameters, each with the tick from which it may leave
-        self._answers: list[tuple[int, bytes]] = []
-        self.log = LogBlocks(
-            log_variables(
-                self.stabilizer.loop,
-                localization=self.localization,
-                supervisor=self.supervisor,
-                battery=self.battery,
-                airframe=airframe,
-                setpoint=lambda: self.setpoint,
-                info=self.info,
-            ),
-            without=without,
-        )
-        self._avoidance = CollisionAvoidance()
-        self._watch_parameters()
-        self.parameters.restore(self.settings.stored)
-        if self._estimator is not None:
-            self.parameters["stabilizer.estimator"] = self._estimator
+        make = settings.make_firmware or _chosen_firmware() or VirtualFirmware
+        self.firmware = make(airframe, settings)
+        self._faulty = self.firmware if isinstance(self.firmware, FaultyFirmware) else None
 
-    def use_kalman(self) -> None:
-        """Choose the Kalman filter, as a positioning deck does at each start."""
-        self._estimator = KALMAN
-        self.parameters["stabilizer.estimator"] = KALMAN
+    @property
+    def supervisor_state(self) -> State:
+        """Return the supervisor's state, which without power is that before it starts."""
+        return State(self.firmware.supervisor_state) if self._powered else State.NOT_INITIALIZED
 
-    def _switch(self, command: int) -> None:
-        """Obey the radio's own processor, which switches the other off and on; the body stays where it is."""
-        if command == SYSTEM_OFF:
-            before = self.stabilizer.loop
-            self._boot()
-            after = self.stabilizer.loop
-            after.truth[:], after.counts[:] = before.truth, before.counts
-            after.truth[MOTORS] = 0.0
-            self._runs_from = math.inf
-        elif command == SYSTEM_ON:
-            self._runs_from = min(self._runs_from, self.tick + _BOOT)
-        self._out.append(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
+    @property
+    def locked(self) -> bool:
+        """Return whether the supervisor was ever locked."""
+        self._locked = self._locked or self.supervisor_state is State.LOCKED
+        return self._locked
 
     def inject(self, fault: VehicleFault) -> None:
-        """Let something go wrong; its start counts from now."""
+        """Let something go wrong; its start counts from now.
+
+        Raises InputError for a fault of the firmware, if this one does not simulate any.
+        """
+        if fault.kind in FIRMWARE_FAULTS and self._faulty is None:
+            raise InputError(
+                f"this firmware does not simulate a fault of kind {fault.kind.value!r}",
+                where=type(self.firmware).__name__,
+                hint="choose a fault of body or battery, or cfplan's own firmware",
+            )
         begin = self.tick + round(1000 * fault.start)
         self._faults.append((begin, begin + 1000 * fault.duration, fault))
 
@@ -144,296 +99,119 @@ class VirtualCrazyflie:
         if fraction or self._thrust_left is not None:
             self._thrust_left = 1.0 - fraction
 
+    def receive(self, packet: bytes) -> None:
+        """Take a packet; its answer comes out of `sent`."""
+        if packet[1:2] == _POWER and len(packet) > 2 and packet[0] & 0xF3 == _POWER_HEADER:
+            self._switch(packet[2])
+        elif self._powered:
+            self.firmware.receive(packet)
+
     def sent(self) -> list[bytes]:
         """Return the packets sent since the last call."""
-        packets, self._out = self._out, []
+        packets = self.firmware.sent() if self._powered else []
+        if self._out:
+            packets, self._out = self._out + packets, []
         return packets
-
-    def say(self, text: str) -> None:
-        """Print a line on the console."""
-        line = text.encode() + b"\n"
-        for start in range(0, len(line), LARGEST_PAYLOAD):
-            self._send(Port.CONSOLE, 0, line[start : start + LARGEST_PAYLOAD])
 
     def advance(self, ticks: int) -> None:
         """Advance by `ticks` milliseconds."""
-        end = self.tick + ticks
-        while self.tick < end:
-            self.command()
-            step = min(end - self.tick, COMMANDER_PERIOD - self.tick % COMMANDER_PERIOD)
-            self._stabilize(step)
-            self.tick += step
+        for _ in range(ticks):
+            self.step()
 
-    def receive(self, packet: bytes) -> None:
-        """Take a packet; its answer comes out of `sent`."""
-        if not packet:
-            return
-        self._heard = self.tick
-        port, channel, payload = packet[0] >> 4, packet[0] & 3, packet[1 : 1 + LARGEST_PAYLOAD]
-        answer: bytes | None = None
-        if (port, channel) == (Port.LINK, POWER_CHANNEL) and payload[:1] == bytes((POWER,)) and len(payload) > 1:
-            self._switch(payload[1])
-        elif self.tick < self._runs_from:
-            return
-        elif port == Port.LINK:
-            answer = answer_link(channel, payload)
-        elif port == Port.PLATFORM:
-            answer = self._platform(channel, payload)
-        elif port == Port.LOG:
-            answer = self.log.receive(channel, payload, self.tick)
-        elif port == Port.PARAMETERS:
-            answer = self.parameters.receive(channel, payload)
-            if answer is not None and self.settings.parameter_delay:
-                self._answers.append(
-                    (self.tick + round(1000 * self.settings.parameter_delay), bytes((channel,)) + answer)
-                )
-                answer = None
-        elif port == Port.MEMORY:
-            answer = self.memories.receive(channel, payload)
-        elif port == Port.HIGH_LEVEL:
-            answer = self.planner.receive(payload, self.tick / 1000, blocked=not self.supervisor.can_fly)
-        elif port == Port.SUPERVISOR:
-            answer = self._supervise(channel, payload)
-        elif port == Port.LOCALIZATION:
-            self._localize(channel, payload)
-        elif port in (Port.SETPOINT, Port.ATTITUDE_SETPOINT):
-            self._take_setpoint(Port(port), channel, payload)
-        if answer is not None:
-            self._send(Port(port), channel, answer)
+    def step(self) -> None:
+        """Advance by a millisecond."""
+        if self.tick % PERIOD == 0:
+            self._update()
+        row = self.noise[self.tick % _NOISE_ROWS]
+        commands = None
+        _sense(self._body, self._force, row, self._gyroscope, self._accelerometer)
+        if self._powered:
+            commands = self.firmware.tick(self._gyroscope, self._accelerometer, self._force, self.battery.voltage)
+        if commands is None:
+            self.motors[:] = 0.0
+            self.off_in_air += self.truth.item(2) > self._body.item(FLOOR) + IN_AIR
+        else:
+            self.motors[:] = commands
+        _move(self._body, self.motors, self._per_command, self._force)
+        self.tick += 1
 
-    def info(self) -> int:
-        """Return the bits of supervisor.info."""
-        return self.supervisor.info(
-            planner_active=self.planner.state in (PlannerState.FLYING, PlannerState.LANDING),
-            planner_finished=self.planner.finished(self.tick / 1000),
-            planner_disabled=self.planner.state is PlannerState.DISABLED,
-        )
-
-    def _send(self, port: Port, channel: int, payload: bytes) -> None:
-        if self.tick >= self._runs_from:
-            self._out.append(pack(port, channel, payload))
-
-    def command(self) -> None:
-        """Run the slower loops if they are due now: planner and log blocks at 100 Hz, supervisor at 25 Hz.
-
-        `advance` does so too; each runs once.
-        """
-        if self.tick % COMMANDER_PERIOD or self.tick == self._commanded:
-            return
-        self._commanded = self.tick
-        self._apply_faults()
-        loop = self.stabilizer.loop
-        can_fly = self.supervisor.can_fly
-        if can_fly:
-            wanted = self.planner.setpoint(self.tick / 1000)
-            if wanted is not None:
-                self.commander.offer(wanted, Priority.HIGH_LEVEL, self.tick)
-        if self.tick % SUPERVISOR_PERIOD == 0:
-            self.supervisor.update(
-                self.tick, self.commander.setpoint.tick if can_fly else 0, self.acceleration / GRAVITY, loop.motors
-            )
-        self.battery.drain(float(loop.truth[13:17].sum()), COMMANDER_PERIOD / 1000)
-        self.stabilizer.loop.vehicle[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
-        while self._answers and self._answers[0][0] <= self.tick:
-            _, answer = self._answers.pop(0)
-            self._send(Port.PARAMETERS, answer[0], answer[1:])
-        if self.tick - self._heard > _CONNECTION_LASTS:
-            self.log.clear()
-        for payload in self.log.due(self.tick, self._silent):
-            self._send(Port.LOG, DATA_CHANNEL, payload)
+    def _update(self) -> None:
+        """Apply faults, drain the battery, and see whether the supervisor has locked."""
+        if self._powers_up:
+            self._powers_up, self._powered = False, True
+            self.firmware.restart()
+        if self._faults or self._thrust_left is not None:
+            self._apply_faults()
+        self.battery.drain(float(self.truth[MOTORS].sum()), PERIOD / 1000)
+        self._body[THRUST_MAX] = self.battery.strength * self._airframe.motor_thrust_max
+        self._locked = self.locked
 
     def _apply_faults(self) -> None:
-        """Apply the faults of this moment to the vehicle."""
-        if not self._faults and self._thrust_left is None:
-            return
-        loop, mass = self.stabilizer.loop, self._airframe.mass
+        """Apply the faults of this moment."""
         acting = {fault.kind: fault.strength for begin, end, fault in self._faults if begin <= self.tick < end}
-        self._silent = tuple(SILENCED[kind] for kind in acting if kind in SILENCED)
-        loop.efficiency[:] = 1.0 if self._thrust_left is None else self._thrust_left
-        loop.efficiency[0] *= acting.get(VehicleFaultKind.MOTOR, 1.0)
+        self.efficiency[:] = 1.0 if self._thrust_left is None else self._thrust_left
+        self.efficiency[0] *= acting.get(VehicleFaultKind.MOTOR, 1.0)
         if VehicleFaultKind.TUMBLE in acting:
-            loop.efficiency[2:4] = 0.0
-        loop.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)
-        loop.vehicle[MASS] = mass * acting.get(VehicleFaultKind.MASS, 1.0)
+            self.efficiency[2:4] = 0.0
+        self.wind[1] = acting.get(VehicleFaultKind.GUST, 0.0)
+        self._body[MASS] = self._airframe.mass * acting.get(VehicleFaultKind.MASS, 1.0)
         if VehicleFaultKind.BATTERY not in acting:
             self.battery.sag = 0.0
         elif self.battery.sag == 0.0:
             self.battery.sag = max(self.battery.voltage - acting[VehicleFaultKind.BATTERY], 0.0)
-        self.supervisor.deck_fault = VehicleFaultKind.DECK in acting and self._version >= _DECKS_SUPERVISED_SINCE
-        if VehicleFaultKind.LOCK in acting and not self.supervisor.locked:
-            self.supervisor.lock()
+        if self._faulty is not None:
+            self._faulty.fail(acting.keys() & FIRMWARE_FAULTS)
 
-    @property
-    def acceleration(self) -> NDArray:
-        """Return specific force in body axes, (3,) m/s²: what the supervisor's low-pass filter leaves of it."""
-        return self.stabilizer.loop.acceleration
+    def _switch(self, command: int) -> None:
+        """Obey as the radio's own processor, which switches the main one off and on; the body stays where it is."""
+        if command == SYSTEM_OFF:
+            self._powered = self._powers_up = False
+            self.truth[MOTORS] = 0.0
+        elif command == SYSTEM_ON:
+            self._powers_up = not self._powered
+        self._out.append(pack(Port.LINK, POWER_CHANNEL, bytes((POWER, command))))
 
-    def _stabilize(self, ticks: int) -> None:
-        supervisor = self.supervisor
-        allowed = supervisor.motors_allowed
-        self.setpoint = self.commander.setpoint if allowed else _MOTORS_OFF
-        if self._avoidance.enable:
-            self.setpoint = self._avoidance.rewrite(self.setpoint, self.stabilizer.loop.belief[0:3])
-        self.stabilizer.run(
-            self.tick,
-            ticks,
-            self.setpoint,
-            self._poses() if self.localization.waits else _NO_POSES,
-            allowed=allowed,
-            level=supervisor.levels_out,
-            flying=supervisor.is_flying,
-        )
 
-    def _poses(self) -> NDArray:
-        """Return the measurements (n, 9) that have come, for the filter."""
-        poses = self.localization.take(self.parameters["locSrv.extPosStdDev"], self.parameters["locSrv.extQuatStdDev"])
-        if self._version < YAW_CORRECT:
-            _reproduce_residual_error(poses, self.stabilizer.loop.belief[6:10])
-        return poses if self.parameters["stabilizer.estimator"] == KALMAN else _NO_POSES
+_POWER_HEADER, _POWER = pack(Port.LINK, POWER_CHANNEL, b"")[0] & 0xF3, bytes((POWER,))  # without the link's own bits
 
-    def _where(self) -> Goal:
-        belief = self.stabilizer.loop.belief
-        still = np.zeros(4)
-        return Goal(np.append(belief[0:3], yaw_of(belief[6:10])), np.append(belief[3:6], 0.0), still, still)
 
-    def _take_setpoint(self, port: Port, channel: int, payload: bytes) -> None:
-        setpoint: Setpoint | None = None
-        try:
-            if port is Port.ATTITUDE_SETPOINT and channel == _SETPOINT_CHANNEL:
-                first = self.commander.priority is Priority.DISABLE
-                setpoint = self._attitude_setpoints.decode(payload, first=first)
-            elif port is Port.SETPOINT and payload and channel == _SETPOINT_CHANNEL:
-                setpoint = decode_setpoint(payload)
-            elif port is Port.SETPOINT and payload and channel == _META_CHANNEL:
-                self._meta(payload)
-        except FirmwareAssert as why:
-            self.say(f"Assert failed: {why}")
-            self.supervisor.lock()
-        if setpoint is not None:
-            self.commander.offer(setpoint, Priority.RADIO, self.tick)
-
-    def _meta(self, payload: bytes) -> None:
-        if payload[0] != _NOTIFY_SETPOINT_STOP:
-            return
-        if len(payload) != 5:
-            raise FirmwareAssert(f"notify setpoint stop with {len(payload) - 1} bytes")
-        self.commander.relax()
-
-    def _localize(self, channel: int, payload: bytes) -> None:
-        self.localization.receive(channel, payload, self.tick)
-        if self.localization.emergency_stop:
-            self.supervisor.emergency_stop()
-        if self.localization.kept_alive:
-            self.localization.kept_alive = False
-            self.supervisor.keep_alive(self.tick)
-
-    def _platform(self, channel: int, payload: bytes) -> bytes | None:
-        if channel == 0 and payload[:1] == bytes((_LEGACY_ARM,)) and len(payload) >= 2:
-            done = self.supervisor.request_arming(bool(payload[1]))
-            return bytes((_LEGACY_ARM, done, self.supervisor.armed))
-        if channel == 0 and payload[:1] == bytes((_LEGACY_RECOVER,)):
-            done = self.supervisor.request_recovery()
-            return bytes((_LEGACY_RECOVER, done, not self.supervisor.crashed))
-        return answer_platform(channel, payload, protocol=self.settings.protocol, firmware=self.settings.firmware)
-
-    def _supervise(self, channel: int, payload: bytes) -> bytes | None:
-        if not payload or self.settings.protocol < _SUPERVISOR_SINCE:
-            return None
-        command = payload[0]
-        head = bytes((command | _RESPONSE,))
-        if channel == _SUPERVISOR_INFO:
-            bits = self.info()
-            if command == _BITFIELD:
-                return head + bits.to_bytes(2, "little")
-            return head + bytes((bits >> (command - 1) & 1,)) if 1 <= command < _BITFIELD else None
-        if channel != _SUPERVISOR_COMMAND:
-            return None
-        if command == _ARM and len(payload) >= 2:
-            done = self.supervisor.request_arming(bool(payload[1]))
-            return head + bytes((done, self.supervisor.armed))
-        if command == _RECOVER:
-            done = self.supervisor.request_recovery()
-            return head + bytes((done, not self.supervisor.crashed))
-        if command == _EMERGENCY_STOP:
-            self.supervisor.emergency_stop()
-        elif command == _KEEP_ALIVE:
-            self.supervisor.keep_alive(self.tick)
+def _chosen_firmware() -> FirmwareFactory | None:
+    """Return the factory that CFPLAN_FIRMWARE names, as `package.module:factory`; None where it is unset."""
+    name = os.environ.get(FIRMWARE_VARIABLE)
+    if not name:
         return None
-
-    def _watch_parameters(self) -> None:
-        def fill(array: NDArray, place: int):
-            return lambda value: array.__setitem__(place, value)
-
-        watch = self.parameters.watch
-        for place, name in enumerate(GAIN_PARAMETERS):
-            watch(name, fill(self.stabilizer.loop.gains, place))
-        for place, name in enumerate(PRIOR_PARAMETERS):
-            watch(name, fill(self.stabilizer.loop.prior, place))
-        for loop, names in enumerate(PID_GAIN_PARAMETERS):
-            for place, name in enumerate(names):
-                watch(name, fill(self.stabilizer.loop.pid_gains[loop], place))
-        for place, name in enumerate(PID_LIMIT_PARAMETERS):
-            watch(name, fill(self.stabilizer.loop.pid_limits, place))
-        for place, name in enumerate(PID_SPEED_PARAMETERS):
-            watch(name, partial(self.stabilizer.limit_speed, place))
-        supervised = self.supervisor.settings
-        watch("supervisor.tmblChckEn", lambda value: setattr(supervised, "tumble_check", bool(value)))
-        watch("supervisor.prefltTimeout", lambda value: setattr(supervised, "preflight_timeout", int(value)))
-        watch("supervisor.landedTimeout", lambda value: setattr(supervised, "landed_timeout", int(value)))
-        watch("supervisor.crashDetectGs", lambda value: setattr(supervised, "crash_detection", value))
-        for place, name in enumerate(("enable", "m1", "m2", "m3", "m4")):
-            watch(f"motorPowerSet.{name}", fill(self.stabilizer.loop.override, place))
-        watch("powerDist.idleThrust", self._set_idle_thrust)
-        avoided = self._avoidance
-        watch("colAv.enable", lambda value: setattr(avoided, "enable", bool(value)))
-        watch("colAv.horizon", lambda value: setattr(avoided, "horizon", value))
-        watch("colAv.maxSpeed", lambda value: setattr(avoided, "max_speed", value))
-        watch("colAv.sidestepThrsh", lambda value: setattr(avoided, "sidestep", value))
-        watch("colAv.vorTol", lambda value: setattr(avoided, "tolerance", value))
-        for place, axis in enumerate("XYZ"):
-            watch(f"colAv.bboxMin{axis}", fill(avoided.low, place))
-            watch(f"colAv.bboxMax{axis}", fill(avoided.high, place))
-        watch("stabilizer.stop", lambda value: setattr(supervised, "stop", bool(value)))
-        watch("stabilizer.controller", self._choose_controller)
-        watch("stabilizer.estimator", self._choose_estimator)
-        watch("kalman.resetEstimation", self._reset_estimation)
-
-    def _set_idle_thrust(self, value: float) -> None:
-        """Set what no motor falls below; the firmware ignores it in vehicles that arm themselves."""
-        idle = 0.0 if self.supervisor.auto_arming else value
-        self.stabilizer.loop.idle[0] = self.supervisor.settings.idle_thrust = idle
-
-    def _choose_controller(self, value: float) -> None:
-        if value not in (PID, MELLINGER):
-            self.parameters["stabilizer.controller"] = PID
-            if value != 0:
-                self.say(f"Controller {value:.0f} is not simulated, PID flies")
-        self.stabilizer.mellinger = value == MELLINGER
-        self.stabilizer.reset_controller()
-
-    def _choose_estimator(self, value: float) -> None:
-        if value not in (COMPLEMENTARY, KALMAN):
-            self.parameters["stabilizer.estimator"] = COMPLEMENTARY
-        self.stabilizer.reset_estimator()
-
-    def _reset_estimation(self, value: float) -> None:
-        if value:
-            self.stabilizer.reset_estimator()
-            self.parameters["kalman.resetEstimation"] = 0
+    module, _, factory = name.partition(":")
+    try:
+        return getattr(import_module(module), factory)
+    except (ImportError, AttributeError, ValueError) as why:
+        raise InputError(
+            f"no firmware {name!r}: {why}",
+            where=FIRMWARE_VARIABLE,
+            hint="package.module:factory, in a module that Python finds; unset it for cfplan's own firmware",
+        ) from why
 
 
-def _reproduce_residual_error(poses: NDArray, belief: NDArray) -> None:
-    """Change measured quaternions so that their residual in body axes is the correct one in world axes.
+def _sensor_noise(sensors: Sensors, seed: int) -> NDArray:
+    chance = np.random.default_rng(seed)
+    noise = np.empty((_NOISE_ROWS, 6))
+    noise[:, :3] = chance.normal(chance.normal(0.0, sensors.gyro_bias, 3), sensors.gyro_noise, (_NOISE_ROWS, 3))
+    noise[:, 3:] = chance.normal(
+        chance.normal(0.0, sensors.acceleration_bias), sensors.acceleration_noise, (_NOISE_ROWS, 3)
+    )
+    return noise
 
-    This was the filter's error before 2025.09.1 (crazyflie-firmware #1292): with yaw beyond 90° it corrected roll and
-    pitch the wrong way.
-    """
-    from scipy.spatial.transform import Rotation  # slow to import, and few vehicles need it
 
-    if not 0.0 < np.linalg.norm(belief) < np.inf:  # the filter has diverged
-        return
-    believed = Rotation.from_quat(belief)
-    for row in poses:
-        if 0.0 < np.linalg.norm(row[3:7]) < np.inf:
-            measured = Rotation.from_quat(row[3:7])
-            row[3:7] = (believed * measured * believed.inv()).as_quat()
+@njit(allocates=False)
+def _sense(body: NDArray, force: NDArray, noise: NDArray, gyroscope: NDArray, accelerometer: NDArray) -> None:
+    """Write what the sensors measure: true body rate and specific force, with errors, (6,)."""
+    for axis in range(3):
+        gyroscope[axis] = body[10 + axis] + noise[axis]
+        accelerometer[axis] = force[axis] + noise[3 + axis]
+
+
+@njit(allocates=False)
+def _move(body: NDArray, commands: NDArray, per_command: float, force: NDArray) -> None:
+    """Let the body move by a millisecond with its motors' commands, and write the specific force, (3,) m/s²."""
+    for motor in range(4):
+        body[ASKED + motor] = commands[motor] * per_command
+    step_and_feel(body, TIME_STEP, force)

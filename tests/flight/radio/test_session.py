@@ -64,8 +64,8 @@ def test_it_opens_and_knows_versions_and_tables(wire, session):
     session.open(FIRST_ANSWER_TIMEOUT, TableCache())
     assert (session.protocol, session.firmware) == (12, "2026.08")
     for found, toc in (
-        (session.parameters, wire.vehicle.parameters.toc),
-        (session.log_variables, wire.vehicle.log.toc),
+        (session.parameters, wire.vehicle.firmware.parameters.toc),
+        (session.log_variables, wire.vehicle.firmware.log.toc),
     ):
         assert found == {entry.full_name: (number, entry.code) for number, entry in enumerate(toc.variables)}
 
@@ -90,7 +90,7 @@ def test_where_each_packet_is_lost_once_and_then_doubled_everything_still_comes(
     assert session.read_parameter("ctrlMel.mass", 2.0) == pytest.approx(0.0345)
     content = bytes(range(100))
     assert session.write_trajectory_memory(content) == content
-    assert bytes(wire.vehicle.memories.trajectory[:100]) == content
+    assert bytes(wire.vehicle.firmware.memories.trajectory[:100]) == content
 
 
 def test_a_known_table_is_not_read_again_also_by_another_process(wire, session, tmp_path):

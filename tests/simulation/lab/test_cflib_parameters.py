@@ -89,7 +89,7 @@ def older():
 
 def test_every_parameter_of_the_table_is_read(newest):
     link, driver = newest
-    on_board = {name: driver.vehicle.parameters[name] for name in NAMES}
+    on_board = {name: driver.vehicle.firmware.parameters[name] for name in NAMES}
     assert link.read_parameters(NAMES, PATIENCE) == pytest.approx(on_board)
 
 
@@ -103,7 +103,7 @@ def test_what_an_older_firmware_lacks_is_left_out(older):
 def test_a_value_is_the_vehicles_of_now_not_that_of_connecting(newest):
     link, driver = newest
     assert link.read_parameters(["colAv.enable"], PATIENCE) == {"colAv.enable": 0}
-    driver.vehicle.parameters["colAv.enable"] = 1
+    driver.vehicle.firmware.parameters["colAv.enable"] = 1
     assert link.read_parameters(["colAv.enable"], PATIENCE) == {"colAv.enable": 1}
 
 

@@ -28,14 +28,14 @@ def test_the_fit_is_within_the_spread_of_what_was_measured(above):
 def hovering(height: float, x: float = 0.0) -> VirtualCrazyflie:
     """A vehicle whose motors have just carried its weight; its commander has nothing to fly."""
     vehicle = VirtualCrazyflie(AIRFRAME, VehicleSettings(position=(x, 0.0, height)))
-    vehicle.stabilizer.loop.truth[13:17] = AIRFRAME.hover_thrust
+    vehicle.truth[13:17] = AIRFRAME.hover_thrust
     return vehicle
 
 
 def left(vehicle: VirtualCrazyflie) -> np.ndarray:
     """Return the fractions of thrust that its motors give in the next 10 ms."""
     vehicle.advance(10)
-    return vehicle.stabilizer.loop.efficiency.copy()
+    return vehicle.efficiency.copy()
 
 
 def test_the_lower_vehicle_loses_thrust_and_the_upper_none():
@@ -51,7 +51,7 @@ def test_what_two_take_adds_up_and_ends_when_they_have_gone():
     share_air([low, high, higher])
     assert left(low) == pytest.approx(1.0 - downwash(0.0, 0.3) - downwash(0.0, 0.6))
     low, gone = low, hovering(1.0, x=1.0)
-    low.stabilizer.loop.truth[13:17] = AIRFRAME.hover_thrust
+    low.truth[13:17] = AIRFRAME.hover_thrust
     share_air([low, gone])
     assert left(low) == pytest.approx(1.0, abs=1e-6)
 

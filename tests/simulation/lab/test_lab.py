@@ -167,7 +167,7 @@ def stepped(monkeypatch):
 def test_a_vehicle_with_poses_on_board_knows_where_it_stands(stepped):
     loop, clock = stepped(ViconSettings(latency=0.03), position=(1.0, 2.0, 0.0))
     clock.sleep(5.0)
-    assert loop.vehicle.stabilizer.loop.belief[:2].tolist() == pytest.approx([1.0, 2.0], abs=0.02)
+    assert loop.vehicle.firmware.stabilizer.loop.belief[:2].tolist() == pytest.approx([1.0, 2.0], abs=0.02)
 
 
 def test_a_vehicle_that_stands_still_is_recorded_a_hundred_times_a_second(stepped):
@@ -186,7 +186,7 @@ def test_a_client_that_falls_silent_is_forgotten_after_two_seconds(stepped):
         told = b""
         for wait, text in ((1.9, "soon"), (0.15, "late")):
             clock.sleep(wait)
-            loop.vehicle.say(text)
+            loop.vehicle.firmware.say(text)
             clock.sleep(0.05)
             with contextlib.suppress(BlockingIOError):
                 while packet := client.recv(64):

@@ -216,3 +216,12 @@ def test_a_vehicle_among_others_flies_as_one_alone(whole_flight):
     armed = next(message for message in alone if isinstance(message, PhaseEntered) and message.phase is Phase.ARM)
     assert [each for each in shared if each.time < armed.time] == [each for each in alone if each.time < armed.time]
     assert len([each for each in shared if each.time < armed.time]) > 300
+
+
+def test_a_fleet_flies_on_another_firmware(whole_flight, monkeypatch):
+    monkeypatch.setenv("CFPLAN_FIRMWARE", "firmware_doubles:Counting")
+    flight = (fleet := fleet_of(delays={"left": 0.0, "right": 0.25})).fly()
+    assert_down(flight)
+    for name, lab in fleet.labs.items():
+        assert lab.vehicle.firmware.calls["receive"] > 500
+        assert np.array_equal(flight.truths[name].position, whole_flight.truths[name].position)

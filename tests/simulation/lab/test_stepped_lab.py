@@ -111,10 +111,10 @@ def test_without_acknowledgements_the_vehicle_has_the_packet_in_the_air_once_and
     link.arm(True)
     link.arm(False)
     lab.clock.sleep(0.4)
-    assert lab.vehicle.supervisor.armed
+    assert lab.vehicle.firmware.supervisor.armed
     assert link.acknowledged <= before
     lab.clock.sleep(0.2)
-    assert not lab.vehicle.supervisor.armed
+    assert not lab.vehicle.firmware.supervisor.armed
     assert lab.now - link.acknowledged < PING_PERIOD + 0.01
 
 
@@ -137,7 +137,7 @@ def test_a_silent_log_leaves_the_other_alone(lab, kind, silent, heard):
 def test_parameters_are_set_and_read_back(lab):
     link = connect(lab, lambda message: None)
     assert link.set_parameter("ctrlMel.mass", 0.0345) == pytest.approx(0.0345)
-    assert lab.vehicle.parameters["ctrlMel.mass"] == pytest.approx(0.0345)
+    assert lab.vehicle.firmware.parameters["ctrlMel.mass"] == pytest.approx(0.0345)
 
 
 def test_a_slow_vehicle_is_waited_for_and_a_silent_one_is_not():

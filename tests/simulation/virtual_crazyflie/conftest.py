@@ -7,7 +7,6 @@ import pytest
 
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.stabilizer import OFF_IN_AIR_TICKS
 from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_crazyflie.vehicle import VirtualCrazyflie
 from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
@@ -49,23 +48,23 @@ class Rig:
 
     @property
     def truth(self):
-        return self.vehicle.stabilizer.loop.truth
+        return self.vehicle.truth
 
     @property
     def belief(self):
-        return self.vehicle.stabilizer.loop.belief
+        return self.vehicle.firmware.stabilizer.loop.belief
 
     @property
     def state(self) -> State:
-        return self.vehicle.supervisor.state
+        return self.vehicle.supervisor_state
 
     @property
     def off_in_air(self) -> int:
         """Milliseconds with motors off in the air, so far."""
-        return int(self.vehicle.stabilizer.loop.counts[OFF_IN_AIR_TICKS])
+        return self.vehicle.off_in_air
 
     def set(self, name: str, value: float) -> None:
-        parameters = self.vehicle.parameters
+        parameters = self.vehicle.firmware.parameters
         number = parameters.toc.index()[name]
         layout = parameters.toc.variables[number].format
         self.send(Port.PARAMETERS, 2, struct.pack("<H", number) + struct.pack(layout, value))

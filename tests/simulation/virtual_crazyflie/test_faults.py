@@ -16,7 +16,7 @@ HOVER, TAKE_OFF = 0.5, 7
 
 
 def set_parameter(rig, name, value):
-    parameters = rig.vehicle.parameters
+    parameters = rig.vehicle.firmware.parameters
     number = parameters.toc.index()[name]
     layout = parameters.toc.variables[number].format
     return rig.send(Port.PARAMETERS, 2, struct.pack("<H", number) + struct.pack(layout, value))
@@ -43,7 +43,7 @@ def test_a_gust_pushes_along_y_and_passes(hovering):
     assert pushed > 0.005
     hovering.run(3.0)
     assert abs(hovering.truth[1]) < pushed
-    assert not hovering.vehicle.stabilizer.loop.wind.any()
+    assert not hovering.vehicle.wind.any()
 
 
 def test_more_mass_needs_more_thrust(hovering):
@@ -75,7 +75,7 @@ def test_a_lock_stops_the_motors_for_good(hovering):
     hovering.vehicle.inject(VehicleFault(VehicleFaultKind.LOCK, 0.1, 0.1))
     hovering.run(1.0)
     assert hovering.state is State.LOCKED
-    assert not hovering.vehicle.stabilizer.loop.motors.any()
+    assert not hovering.vehicle.motors.any()
 
 
 def test_a_battery_sags_to_the_voltage_named_and_comes_back(hovering):
@@ -96,7 +96,7 @@ def test_motors_weaken_with_voltage_as_measured(voltage, thrust):
 def test_a_stubborn_parameter_keeps_its_value():
     rig = Rig(VehicleSettings(stubborn=("stabilizer.controller",)))
     assert set_parameter(rig, "stabilizer.controller", 2)
-    assert rig.vehicle.parameters["stabilizer.controller"] == 1
+    assert rig.vehicle.firmware.parameters["stabilizer.controller"] == 1
 
 
 def test_a_slow_write_is_answered_after_its_delay():
@@ -111,7 +111,7 @@ def test_a_slow_write_is_answered_after_its_delay():
 def test_older_firmware_has_no_supervisor_port_and_no_drag():
     rig = Rig(VehicleSettings(protocol=10, firmware="2025.12"))
     assert not rig.send(Port.SUPERVISOR, 0, bytes((12,)))
-    assert "kalman.dragB_x" not in rig.vehicle.parameters.toc.index()
+    assert "kalman.dragB_x" not in rig.vehicle.firmware.parameters.toc.index()
     assert rig.send(Port.PLATFORM, 0, bytes((1, 1)))
 
 

@@ -53,8 +53,8 @@ def test_go_to_before_notify_leaves_none(streamed):
 def test_streaming_takes_over_from_the_planner_without_a_gap(hovering):
     hovering.stream_hover(0.5)
     assert hovering.off_in_air == 0
-    assert hovering.vehicle.commander.priority is Priority.RADIO
-    assert hovering.vehicle.planner.state is PlannerState.IDLE
+    assert hovering.vehicle.firmware.commander.priority is Priority.RADIO
+    assert hovering.vehicle.firmware.planner.state is PlannerState.IDLE
 
 
 def test_a_command_while_the_stream_goes_on_is_forgotten(streamed):
@@ -63,13 +63,13 @@ def test_a_command_while_the_stream_goes_on_is_forgotten(streamed):
     streamed.stream_hover(0.3)
     streamed.notify_setpoint_stop()
     streamed.run(0.05)
-    assert not streamed.vehicle.stabilizer.loop.motors.any()  # idle again: it wants nothing
+    assert not streamed.vehicle.motors.any()  # idle again: it wants nothing
 
 
 def test_the_setpoint_of_a_closing_link_cuts_the_motors_in_flight(hovering):
     hovering.send(Port.ATTITUDE_SETPOINT, 0, ZERO_ATTITUDE)
     hovering.run(0.01)
-    assert not hovering.vehicle.stabilizer.loop.motors.any()
+    assert not hovering.vehicle.motors.any()
     assert hovering.off_in_air > 0
 
 
@@ -79,7 +79,7 @@ def test_a_stale_priority_makes_take_off_do_nothing_though_it_says_well(rig):
     assert rig.take_off() == 0
     rig.run(2.0)
     assert rig.truth[2] == 0.0
-    assert not rig.vehicle.stabilizer.loop.motors.any()
+    assert not rig.vehicle.motors.any()
 
 
 def test_notifying_first_lets_take_off_happen(rig):
@@ -94,7 +94,7 @@ def test_notifying_first_lets_take_off_happen(rig):
 def test_an_idle_planner_keeps_setpoints_fresh_on_the_floor(rig):
     rig.run(5.0)
     assert rig.state is State.READY_TO_FLY
-    assert rig.vehicle.tick - rig.vehicle.commander.setpoint.tick <= 10
+    assert rig.vehicle.tick - rig.vehicle.firmware.commander.setpoint.tick <= 10
 
 
 def test_take_off_is_refused_while_the_planner_flies(hovering):
@@ -126,7 +126,7 @@ def test_the_answer_carries_the_command_and_the_return_code_in_the_fourth_byte(r
 def test_stop_cuts_the_motors(hovering):
     assert hovering.high_level(struct.pack("<BB", 3, 0)) == 0
     hovering.run(0.02)
-    assert not hovering.vehicle.stabilizer.loop.motors.any()
+    assert not hovering.vehicle.motors.any()
 
 
 def test_commands_for_another_group_do_nothing(hovering):

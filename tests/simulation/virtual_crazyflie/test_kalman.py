@@ -172,7 +172,7 @@ def test_without_poses_an_accelerometer_that_says_too_little_lifts_the_vehicle(m
         rig.set("locSrv.extPosStdDev", EXTERNAL_POSITION_STD)
         rig.take_off()
         rig.run(2.5)
-        before, off = rig.truth[2], rig.vehicle.stabilizer.loop.noise[0, 5]
+        before, off = rig.truth[2], rig.vehicle.noise[0, 5]
         rig.feeding = False
         rig.run(1.5)
         assert rig.truth[2] - before == pytest.approx(-off * 1.5**2 / 2, rel=0.25, abs=0.005)
@@ -234,8 +234,7 @@ def test_the_drag_parameters_take_away_the_error_of_velocity_at_speed(make_rig):
 
 def test_a_pose_turned_by_half_a_turn_does_not_end_the_simulation():
     """Half a turn divides by zero in the filter, and gives infinity there as it does on board."""
-    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"])
-    vehicle.use_kalman()
+    vehicle = VirtualCrazyflie(AIRFRAMES["crazyflie-2.1+"], VehicleSettings(stored={"stabilizer.estimator": 2}))
     vehicle.receive(b"\x6d\x08" + struct.pack("<7f", 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
     vehicle.advance(100)
     assert vehicle.tick == 100

@@ -93,7 +93,7 @@ def test_a_written_value_is_echoed_and_read_back(rig):
     payload = struct.pack("<Hf", parameter_id("ctrlMel.mass"), 0.0333)
     assert rig.send(Port.PARAMETERS, 2, payload)[0][1:] == payload
     assert read(rig, "ctrlMel.mass") == pytest.approx(0.0333)
-    assert rig.vehicle.stabilizer.loop.gains[0] == pytest.approx(0.0333)
+    assert rig.vehicle.firmware.stabilizer.loop.gains[0] == pytest.approx(0.0333)
 
 
 def test_a_read_only_parameter_is_left_alone_in_silence(rig):

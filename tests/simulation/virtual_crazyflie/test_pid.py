@@ -76,14 +76,14 @@ def test_an_attitude_setpoint_tilts_as_told(hovering):
 
 def test_thrust_stays_locked_until_a_zero_has_come(rig):
     payload = struct.pack("<fffH", 0.0, 0.0, 0.0, 50000)
-    rig.vehicle.commander.priority = 0
+    rig.vehicle.firmware.commander.priority = 0
     rig.send(Port.ATTITUDE_SETPOINT, 0, payload)
     rig.run(0.1)
-    assert not rig.vehicle.stabilizer.loop.motors.any()
+    assert not rig.vehicle.motors.any()
     rig.send(Port.ATTITUDE_SETPOINT, 0, struct.pack("<fffH", 0.0, 0.0, 0.0, 0))
     rig.send(Port.ATTITUDE_SETPOINT, 0, payload)
     rig.run(0.1)
-    assert rig.vehicle.stabilizer.loop.motors.all()
+    assert rig.vehicle.motors.all()
 
 
 def test_levelling_out_keeps_height(hovering):
@@ -96,6 +96,6 @@ def test_levelling_out_keeps_height(hovering):
 def test_a_controller_that_is_not_simulated_leaves_pid_flying(hovering):
     hovering.set("stabilizer.controller", 5)
     hovering.run(1.0)
-    assert hovering.vehicle.parameters["stabilizer.controller"] == 1
+    assert hovering.vehicle.firmware.parameters["stabilizer.controller"] == 1
     assert hovering.truth[2] == pytest.approx(0.8, abs=0.3)
     assert any(b"not simulated" in packet for packet in hovering.received)

@@ -15,8 +15,8 @@ def switch(rig, command: int) -> list[bytes]:
 def test_a_restart_ends_a_lock_and_nothing_answers_meanwhile(make_rig):
     rig = make_rig(VehicleSettings(position=(0.4, -0.3, 0.0), yaw=0.5, auto_arming=False))
     rig.run(0.5)
-    rig.vehicle.parameters["stabilizer.controller"] = 2
-    rig.vehicle.supervisor.emergency_stop()
+    rig.vehicle.firmware.parameters["stabilizer.controller"] = 2
+    rig.vehicle.firmware.supervisor.emergency_stop()
     rig.run(0.2)
     assert rig.state is State.LOCKED
     place = rig.truth.copy()
@@ -29,7 +29,7 @@ def test_a_restart_ends_a_lock_and_nothing_answers_meanwhile(make_rig):
     rig.run(1.0)
     assert rig.send(Port.LINK, 0, b"ping")
     assert rig.state is State.CHECKS_PASSED
-    assert rig.vehicle.parameters["stabilizer.controller"] == 1
+    assert rig.vehicle.firmware.parameters["stabilizer.controller"] == 1
     assert np.array_equal(rig.truth, place)
 
 

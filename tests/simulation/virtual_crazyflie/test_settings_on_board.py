@@ -105,7 +105,8 @@ def lag_of(rig):
         place = start + np.array([along, 0.0, 0.0])
         worst = max(worst, float(np.abs(rig.truth[0] - place[0])))
         speed, pull = 1.5 * (1 - np.exp(-3 * time)), 4.5 * np.exp(-3 * time)
-        rig.vehicle.commander.offer(full_state(place, (speed, 0, 0), (pull, 0, 0), (0, 0, 0)), Priority.RADIO, tick)
+        setpoint = full_state(place, (speed, 0, 0), (pull, 0, 0), (0, 0, 0))
+        rig.vehicle.firmware.commander.offer(setpoint, Priority.RADIO, tick)
 
     rig.run(1.0, send)
     return worst
@@ -116,45 +117,45 @@ def test_a_motor_test_turns_the_motors_of_an_armed_vehicle(rig):
     rig.set("motorPowerSet.m3", 7000)
     rig.set("motorPowerSet.enable", 1)
     rig.run(0.3)
-    assert rig.vehicle.stabilizer.loop.motors.tolist() == [9000, 0, 7000, 0]
+    assert rig.vehicle.motors.tolist() == [9000, 0, 7000, 0]
     rig.set("motorPowerSet.enable", 2)
     rig.run(0.1)
-    assert rig.vehicle.stabilizer.loop.motors.tolist() == [9000] * 4
+    assert rig.vehicle.motors.tolist() == [9000] * 4
     rig.set("motorPowerSet.enable", 0)
     rig.run(0.1)
-    assert not rig.vehicle.stabilizer.loop.motors.any()
+    assert not rig.vehicle.motors.any()
 
 
 @pytest.mark.parametrize("locked", [False, True])
 def test_a_motor_test_turns_the_motors_of_a_vehicle_that_is_disarmed_or_locked(locked):
     rig = Rig(VehicleSettings(auto_arming=False, stored={"motorPowerSet.enable": 1, "motorPowerSet.m1": 9000}))
     if locked:
-        rig.vehicle.supervisor.emergency_stop()
+        rig.vehicle.firmware.supervisor.emergency_stop()
     rig.run(1.0)
-    assert rig.vehicle.supervisor.locked == locked
-    assert not rig.vehicle.supervisor.armed
-    assert rig.vehicle.stabilizer.loop.motors.tolist() == [9000, 0, 0, 0]
+    assert rig.vehicle.firmware.supervisor.locked == locked
+    assert not rig.vehicle.firmware.supervisor.armed
+    assert rig.vehicle.motors.tolist() == [9000, 0, 0, 0]
     rig.set("motorPowerSet.enable", 0)
     rig.run(0.1)
-    assert not rig.vehicle.stabilizer.loop.motors.any()
+    assert not rig.vehicle.motors.any()
 
 
 @pytest.mark.parametrize(("auto_arming", "idle"), [(True, 0), (False, 5000)])
 def test_idle_thrust_turns_motors_only_where_arming_is_asked_for(auto_arming, idle):
     rig = Rig(VehicleSettings(auto_arming=auto_arming, stored={"powerDist.idleThrust": 5000}))
     rig.run(0.2)
-    rig.vehicle.supervisor.request_arming(True)
+    rig.vehicle.firmware.supervisor.request_arming(True)
     rig.run(0.2)
-    assert rig.vehicle.supervisor.state is State.READY_TO_FLY
-    assert rig.vehicle.stabilizer.loop.motors.tolist() == [idle] * 4
+    assert rig.vehicle.firmware.supervisor.state is State.READY_TO_FLY
+    assert rig.vehicle.motors.tolist() == [idle] * 4
     rig.run(3.0)
-    assert rig.vehicle.supervisor.state is State.READY_TO_FLY  # idle thrust is no flight
+    assert rig.vehicle.firmware.supervisor.state is State.READY_TO_FLY  # idle thrust is no flight
 
 
 def test_stored_values_are_there_at_power_up_and_known_as_stored():
     rig = Rig(VehicleSettings(stored={"ctrlMel.kR_xy": 65000.0, "no.such": 1.0}))
-    assert rig.vehicle.parameters["ctrlMel.kR_xy"] == 65000.0
-    assert 65000.0 in rig.vehicle.stabilizer.loop.gains
+    assert rig.vehicle.firmware.parameters["ctrlMel.kR_xy"] == 65000.0
+    assert 65000.0 in rig.vehicle.firmware.stabilizer.loop.gains
 
 
 def test_what_came_with_a_version_is_in_the_tables_of_the_newest():

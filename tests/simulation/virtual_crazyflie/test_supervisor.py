@@ -60,7 +60,7 @@ def test_the_airframe_says_whether_it_arms_itself():
     for name, arms_itself in (("crazyflie-2.1+", True), ("crazyflie-2.1-brushless", False)):
         vehicle = VirtualCrazyflie(AIRFRAMES[name])
         vehicle.advance(300)
-        assert vehicle.supervisor.can_fly == arms_itself
+        assert vehicle.firmware.supervisor.can_fly == arms_itself
 
 
 def test_an_armed_vehicle_that_does_not_fly_disarms_after_30_s_and_arms_itself_again():
@@ -162,10 +162,10 @@ def test_info_bits_are_those_that_cflib_knows():
 def test_a_planner_that_is_given_no_number_is_disabled_until_a_setpoint_comes(hovering):
     assert hovering.go_to(np.nan, 0.0, 1.0) == 0
     hovering.run(0.1)
-    assert hovering.vehicle.info() & HIGH_LEVEL_DISABLED
-    assert not hovering.vehicle.info() & HIGH_LEVEL_ACTIVE
+    assert hovering.vehicle.firmware.info() & HIGH_LEVEL_DISABLED
+    assert not hovering.vehicle.firmware.info() & HIGH_LEVEL_ACTIVE
     hovering.stream_hover(0.1)
-    assert not hovering.vehicle.info() & HIGH_LEVEL_DISABLED
+    assert not hovering.vehicle.firmware.info() & HIGH_LEVEL_DISABLED
 
 
 def test_the_fault_of_a_deck_keeps_a_vehicle_on_the_floor_and_locks_one_in_the_air(make_rig):
@@ -178,7 +178,7 @@ def test_the_fault_of_a_deck_keeps_a_vehicle_on_the_floor_and_locks_one_in_the_a
         rig.vehicle.inject(VehicleFault(VehicleFaultKind.DECK, 0.0, 0.3))
         rig.run(0.2)
     assert on_floor.state is State.CHECKS_NOT_PASSED
-    assert on_floor.vehicle.info() & DECK_FAULT
+    assert on_floor.vehicle.firmware.info() & DECK_FAULT
     assert in_air.state is State.LOCKED
     assert old.state is State.FLYING  # it knows nothing of decks
     on_floor.run(0.5)
@@ -200,7 +200,7 @@ def test_an_emergency_stop_packet_cuts_the_motors_in_flight(hovering):
     assert hovering.send(Port.SUPERVISOR, 1, b"\x03") == []
     hovering.run(0.1)
     assert hovering.state is State.LOCKED
-    assert not hovering.vehicle.stabilizer.loop.motors.any()
+    assert not hovering.vehicle.motors.any()
     hovering.run(1.0)
     assert hovering.truth[2] == 0.0
     assert hovering.take_off() == 16  # EBUSY
@@ -229,7 +229,7 @@ def test_a_descent_with_less_than_half_a_g_of_thrust_for_a_second_is_taken_for_a
     assert rig.state is State.FLYING
     rig.run(0.4, setpoint)
     assert rig.state is State.CRASHED
-    assert not rig.vehicle.stabilizer.loop.motors.any()
+    assert not rig.vehicle.motors.any()
 
 
 def test_the_stream_stopping_levels_out_then_falls(streamed):
@@ -246,10 +246,10 @@ def test_the_stream_stopping_levels_out_then_falls(streamed):
 @pytest.mark.parametrize("length", [1, 15, 28, 30])
 def test_a_full_state_of_wrong_length_stops_the_firmware(hovering, length):
     hovering.send(Port.SETPOINT, 0, bytes([6]) + bytes(length - 1))
-    assert hovering.vehicle.supervisor.locked
+    assert hovering.vehicle.firmware.supervisor.locked
     assert any(b"Assert" in packet for packet in hovering.received)
 
 
 def test_a_notification_of_wrong_length_stops_the_firmware(hovering):
     hovering.send(Port.SETPOINT, 1, struct.pack("<BH", 0, 0))
-    assert hovering.vehicle.supervisor.locked
+    assert hovering.vehicle.firmware.supervisor.locked
