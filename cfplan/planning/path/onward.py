@@ -62,7 +62,7 @@ def onward_paths(starts: list[Knots], departure: Departure, limits: Limits, spee
     course = Course((None,) * len(starts[0].waypoint), departure.yaw, departure.yaw_angle, departure.state)
     begun = max(speed, float(np.linalg.norm(departure.velocity)))  # a path made for braking at once would turn too fast
     soft = [_soft(knots, course.regions, limits, room, begun) for knots in starts]
-    firsts = [np.append(0.0, each.variables.first) for each in soft]
+    firsts = [each.first for each in soft]
     costs = [each(first)[0] for each, first in zip(soft, firsts, strict=True)]
     for number in np.argsort(costs, kind="stable"):
         each, x = soft[number], firsts[number]

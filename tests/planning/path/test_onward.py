@@ -1,5 +1,7 @@
 """Paths on which a vehicle goes on: where their choice begins, what they cost, and that they begin in its state."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from cfplan.planning.path.onward import Departure, along, onward_paths, toward
 from cfplan.planning.path.room import Room
 from cfplan.planning.path.soft_limits import SoftLimits
 from cfplan.planning.path.variables import Knots, variables_of
+from cfplan.safety.space import Box, Cylinder
 from cfplan.vehicle.profile import BoundaryState
 
 MOVED = 1e-5
@@ -19,15 +22,16 @@ MOTION = np.array([POINTS[0], [1.2, 0.6, 0.1], [1.0, -2.0, 0.5], [5.0, -8.0, 3.0
 @pytest.mark.parametrize("outside", [False, True], ids=["inside", "with points outside"])
 @pytest.mark.parametrize("moving", [False, True], ids=["from rest", "in motion"])
 def test_the_gradient_of_soft_limits_is_that_of_central_differences(limits, moving, outside):
-    """Of times, of points, and of the unit of time; so fast that all limits are exceeded somewhere."""
+    """Of times and points, near obstacles; so fast that all limits are exceeded somewhere."""
     points = POINTS.copy()
     points[1, 0] += 2.0 * outside  # beyond a wall
-    space = limits.space
+    obstacles = Box((0.9, -0.1, 0.8), (1.2, 0.1, 1.3), 0.4), Cylinder(0.3, 0.9, 0.1, 0.0, 1.0)
+    space = replace(limits.space, obstacles=obstacles if outside else ())
     assert (space.beyond(points).max() > 0.0) == outside
     knots = Knots(centripetal_times(points) / 2, points, np.array([0, 2, 3]), MOTION if moving else None)
     room = Room(space, points[knots.waypoint], None)
     cost = SoftLimits(variables_of(knots, (None,) * 3, 1, space.margin), limits, room, limits.plan.speed)
-    first = np.append(0.0, cost.variables.first)
+    first = cost.first
     random = np.random.default_rng(5)
     for x in (first, first + random.normal(scale=0.3, size=first.shape)):
         _, gradient = cost(x)
