@@ -12,6 +12,7 @@ from cfplan.geometry.min_snap import ENERGY, HERMITE, REST, derivatives_at, solv
 from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 
+
 def _bases() -> NDArray:
     """Return (6, 8, 8): for each order of derivative, the matrix from values at both ends of [0, 1] to coefficients."""
     bases = [HERMITE]
@@ -35,9 +36,7 @@ def gradient_by_times_and_points(
     # Sums over the places of each piece: by the values at its ends, in units of its time, and by its left point; what
     # its places contribute when they move by s, and when its time scales.
     by_ends, by_left, moved, scaled = _sum_over_places(points, times, derivatives, s, by_path, BASES)
-    by_times, by_points = gradient_by_ends(
-        points, times, derivatives, by_ends, by_left, 0 if start is None else 1
-    )
+    by_times, by_points = gradient_by_ends(points, times, derivatives, by_ends, by_left, 0 if start is None else 1)
     return by_times - scaled - (moved.sum() - moved.cumsum()), by_points
 
 

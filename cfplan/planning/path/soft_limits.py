@@ -88,7 +88,7 @@ class SoftLimits:
         return self.variables.start._replace(points=points, times=times)
 
     def __call__(self, x: NDArray) -> tuple[float, NDArray]:
-        return _cost(x, self._terms, self.weight)  # type: ignore[no-any-return]  # compiled
+        return _cost(x, self._terms, self.weight)
 
 
 @njit(error_model="numpy")
@@ -116,17 +116,18 @@ def _cost(x: NDArray, terms: _Terms, weight: float) -> tuple[float, NDArray]:
     by_ends, by_left, by_times = np.zeros((count, 8, 3)), np.zeros((count, 3)), np.ones(count)
     cost = times.sum()
     path, by_path = np.empty((5, 3)), np.empty((5, 3))
+    share = weight / _PLACES
     for n in range(count):
         for q in range(_PLACES):
             _write_place(path, points[n], ends[n], times[n], q)
             excess = _excess(path, by_path, terms)
-            cost += weight * times[n] / _PLACES * excess
-            by_times[n] += weight / _PLACES * excess
-            unit = weight * times[n] / _PLACES
+            cost += share * times[n] * excess
+            by_times[n] += share * excess
+            unit = share * times[n]
             for order in range(5):
                 for axis in range(3):
                     by = by_path[order, axis] * unit
-                    by_times[n] -= order * by_path[order, axis] * path[order, axis] * weight / _PLACES
+                    by_times[n] -= order * by_path[order, axis] * path[order, axis] * share
                     for row in range(8):
                         by_ends[n, row, axis] += _AT_PLACES[order, q, row] * by
                     if order == 0:
@@ -191,9 +192,7 @@ def _beyond(vector: NDArray, by_vector: NDArray, bound: float, weight: float) ->
 
 
 @njit(error_model="numpy")
-def _add_jump(
-    ends: NDArray, time: float, terms: _Terms, weight: float, by_ends: NDArray, by_times: NDArray
-) -> float:
+def _add_jump(ends: NDArray, time: float, terms: _Terms, weight: float, by_ends: NDArray, by_times: NDArray) -> float:
     """Return the cost of the jump of snap at the start before it is faded in, s, and add its gradient."""
     cost = 0.0
     for axis in range(3):

@@ -5,12 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cfplan.deadline import NEVER
 from cfplan.geometry.min_snap import centripetal_times
+from cfplan.geometry.path_file import path_through
 from cfplan.planning.continuation import plan_from_rest
-from cfplan.planning.path.onward import Departure, along, onward_paths, toward
+from cfplan.planning.path.onward import STEPS, Departure, along, onward_paths, toward
 from cfplan.planning.path.room import Room
+from cfplan.planning.path.search import search
 from cfplan.planning.path.soft_limits import SoftLimits
 from cfplan.planning.path.variables import Knots, variables_of
+from cfplan.planning.plan import plan
 from cfplan.safety.space import Box, Cylinder
 from cfplan.vehicle.profile import BoundaryState
 
@@ -76,3 +80,23 @@ def test_the_path_left_is_where_a_descent_begins_that_goes_on_along_it(limits):
     np.testing.assert_allclose(knots.points[knots.waypoint], [state.position, *POINTS[1:], *more], atol=1e-9)
     flown = leave + knots.breaks[: knots.waypoint[-2] + 1]
     np.testing.assert_allclose(trajectory.at(flown).position, knots.points[: len(flown)], atol=1e-6)
+
+
+def test_a_choice_is_the_same_again_and_ends_after_a_bounded_number_of_evaluations(limits, monkeypatch):
+    """Whatever the computer's load, so that a flight on the stepped clock is the same on every run."""
+    evaluated = []
+    cost = SoftLimits.__call__
+    monkeypatch.setattr(SoftLimits, "__call__", lambda each, x: evaluated.append(x) or cost(each, x))
+    moving = Departure(POINTS[0], MOTION, BoundaryState(1.0, 0.0, 0.0, 0.0, 0.0))
+    begins = toward(moving, POINTS[1:], limits)
+    first, again = (next(onward_paths(begins, moving, limits, limits.plan.speed)) for _ in range(2))
+    np.testing.assert_array_equal(first.times, again.times)
+    np.testing.assert_array_equal(first.points, again.points)
+    assert len(evaluated) / 2 <= len(begins) + 1.2 * STEPS
+
+
+def test_a_path_chosen_in_the_air_is_flown_nearly_as_soon_as_one_searched_for_without_haste(limits):
+    """From rest, where both choose among the same paths."""
+    searched = search(path_through(POINTS), limits, NEVER).knots.path
+    made = plan(searched, limits.airframe, limits, planner="expert")
+    assert plan_from_rest(POINTS, limits).plan.trajectory.duration < 1.03 * made.trajectory.duration
