@@ -25,9 +25,9 @@ from cfplan.safety.limits import Limits
 from cfplan.vehicle.profile import BoundaryState
 from cfplan.vehicle.trajectory import Trajectory
 
-# Weights of the excess over soft limits, in successive descents. With 0.3 first, flights are 0.5 % shorter, but more
-# paths cannot be flown; with 1, they are 0.8 % longer.
-WEIGHTS = (0.5, 10.0, 100.0)
+# Weights of the excess over soft limits, in successive descents. If 1 is the first, flights are 1 % longer; without the
+# last, more paths cannot be flown.
+WEIGHTS = (0.3, 3.0, 30.0, 300.0)
 STEPS, TOLERANCE = 100, 5e-4  # of descents; the tolerance is a fraction of the cost
 _ASSUMED_ACCELERATION = 0.7  # fraction of the limit on acceleration that is assumed in initial paths
 _SOON = 0.1  # s, the shortest segment of an initial path

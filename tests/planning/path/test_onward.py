@@ -99,4 +99,4 @@ def test_a_path_chosen_in_the_air_is_flown_nearly_as_soon_as_one_searched_for_wi
     """From rest, where both choose among the same paths."""
     searched = search(path_through(POINTS), limits, NEVER).knots.path
     made = plan(searched, limits.airframe, limits, planner="expert")
-    assert plan_from_rest(POINTS, limits).plan.trajectory.duration < 1.03 * made.trajectory.duration
+    assert plan_from_rest(POINTS, limits).plan.trajectory.duration < 1.05 * made.trajectory.duration
