@@ -27,7 +27,7 @@ from cfplan.preparation.link_loss_assessment import OUTSIDE_HINT, assess_link_lo
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import rehearse_motion, rehearse_setpoints
-from cfplan.simulation.glitches import glitch_at_sampled_setpoints
+from cfplan.simulation.glitches import glitch_near_critical_setpoints
 from cfplan.simulation.link_loss import LinkLossMoments, as_believed, foreseen_link_loss, link_loss_at_walls
 from cfplan.vehicle.joint import JoinedTrajectory
 
@@ -235,6 +235,6 @@ def foresee_link_loss(payloads: NDArray, limits: Limits, starts: NDArray) -> Non
 def meet_gaps(payloads: NDArray, limits: Limits, starts: NDArray | None) -> None:
     """Raise EndsBadlyError if the vehicle is lost after a gap in setpoints or poses."""
     believed = None if starts is None else as_believed(starts, limits)
-    glitches = glitch_at_sampled_setpoints(payloads, limits, start=believed)
+    glitches = glitch_near_critical_setpoints(payloads, limits, start=believed)
     if glitches.lost.any():
         raise EndsBadlyError(str(glitches), where="glitches", hint="plan with a lower speed or acceleration")

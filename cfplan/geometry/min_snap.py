@@ -162,38 +162,51 @@ def pieces_through(points: NDArray, times: NDArray, start: NDArray | None, rest_
 
 def derivatives_at(points: NDArray, times: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
     """Return γ', γ'', γ''' with the least snap at each point, (K, 3, 3); see pieces_through()."""
-    derivatives = np.zeros((len(points), 3, 3))
+    given = np.zeros((len(points), 3, 3))
     if start is not None:
-        derivatives[0] = start
-    first, last = _unknown(points, start, rest_end)
-    if last > first:
-        matrix, force = _equations(derivatives, points, times, first, last, ENERGY)
-        solution, definite = _solve_scaled(matrix, force)
-        if not definite:
-            far = int(np.argmax(times))
-            raise InputError(
-                f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
-                f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
-                where=f"waypoint {far + 2}",
-                hint="correct the mistyped coordinate, or add points between",
-            )
-        derivatives[first:last] = solution.reshape(-1, 3, 3)
-    return derivatives
+        given[0] = start
+    derivatives, definite = solve_derivatives(points, times, given, *unknown(points, start, rest_end))
+    if not definite:
+        far = int(np.argmax(times))
+        raise InputError(
+            f"from the point before it is {np.linalg.norm(points[far + 1] - points[far]):g} m, others are "
+            f"{np.linalg.norm(np.diff(points, axis=0), axis=1).min():g} m apart: no smooth path joins these",
+            where=f"waypoint {far + 2}",
+            hint="correct the mistyped coordinate, or add points between",
+        )
+    return np.asarray(derivatives)
 
 
-def solve_adjoint(points: NDArray, times: NDArray, right: NDArray, start: NDArray | None, rest_end: bool) -> NDArray:
-    """Return the solution of derivatives_at()'s equations for another right side, (K, 3, 3); 0 at given derivatives."""
-    result = np.zeros((len(points), 3, 3))
-    first, last = _unknown(points, start, rest_end)
-    if last > first:
-        matrix, _ = _equations(result, points, times, first, last, ENERGY)
-        result[first:last] = _solve_scaled(matrix, right[first:last].reshape(-1, 3))[0].reshape(-1, 3, 3)
-    return result
-
-
-def _unknown(points: NDArray, start: NDArray | None, rest_end: bool) -> tuple[int, int]:
+def unknown(points: NDArray, start: NDArray | None, rest_end: bool) -> tuple[int, int]:
     """Return the first point whose derivatives are unknown, and the end of these points."""
     return 0 if start is None else 1, len(points) - 1 if rest_end else len(points)
+
+
+@njit(error_model="numpy")
+def solve_derivatives(points: NDArray, times: NDArray, given: NDArray, first: int, last: int) -> tuple[NDArray, bool]:
+    """Return γ', γ'', γ''' with the least snap at each point, (K, 3, 3), and whether there are any.
+
+    They are unknown from point `first` on, before `last`, as unknown() returns them; elsewhere `given`, (K, 3, 3), has
+    them.
+    """
+    derivatives = given.copy()
+    if last <= first:
+        return derivatives, True
+    matrix, force = _equations(derivatives, points, times, first, last, ENERGY)
+    solution, definite = _solve_scaled(matrix, force)
+    derivatives[first:last] = solution.reshape(-1, 3, 3)
+    return derivatives, definite
+
+
+@njit(error_model="numpy")
+def solve_adjoint(points: NDArray, times: NDArray, right: NDArray, first: int, last: int) -> NDArray:
+    """Return the solution of solve_derivatives()'s equations for another right side, (K, 3, 3); 0 where given."""
+    result = np.zeros((len(points), 3, 3))
+    if last > first:
+        matrix, _ = _equations(result, points, times, first, last, ENERGY)
+        solution, _ = _solve_scaled(matrix, right[first:last].copy().reshape(-1, 3))
+        result[first:last] = solution.reshape(-1, 3, 3)
+    return result
 
 
 @njit(error_model="numpy")

@@ -12,8 +12,6 @@ from cfplan.geometry.min_snap import ENERGY, HERMITE, REST, derivatives_at, solv
 from cfplan.geometry.polynomials import intervals_of
 from cfplan.machine_code import njit
 
-_POWERS = np.tile(np.arange(4), 2)  # of a segment's time, by which the values at its ends scale
-
 
 def _bases() -> NDArray:
     """Return (6, 8, 8): for each order of derivative, the matrix from values at both ends of [0, 1] to coefficients."""
@@ -38,46 +36,62 @@ def gradient_by_times_and_points(
     # Sums over the places of each piece: by the values at its ends, in units of its time, and by its left point; what
     # its places contribute when they move by s, and when its time scales.
     by_ends, by_left, moved, scaled = _sum_over_places(points, times, derivatives, s, by_path, BASES)
-    by_times, by_points = gradient_by_ends(points, times, derivatives, by_ends, by_left, start)
+    by_times, by_points = gradient_by_ends(points, times, derivatives, by_ends, by_left, 0 if start is None else 1)
     return by_times - scaled - (moved.sum() - moved.cumsum()), by_points
 
 
+@njit(error_model="numpy")
 def gradient_by_ends(
-    points: NDArray, times: NDArray, derivatives: NDArray, by_ends: NDArray, by_left: NDArray, start: NDArray | None
+    points: NDArray, times: NDArray, derivatives: NDArray, by_ends: NDArray, by_left: NDArray, known: int
 ) -> tuple[NDArray, NDArray]:
     """Return the gradient by segment times, (K-1,), and points, (K, 3), of a function of the values at pieces' ends.
 
     `by_ends`, (K-1, 8, 3), is its gradient by ends_of(), `by_left`, (K-1, 3), that by the left point of each piece.
+    Derivatives are given at the first `known` points, 0 or 1, and at the last.
     """
-    adjoint = solve_adjoint(points, times, _by_derivatives(times, by_ends), start, rest_end=True)
+    count = len(times)
+    right = np.zeros((count + 1, 3, 3))
+    for n in range(count):
+        unit = 1.0
+        for order in range(3):
+            unit *= times[n]
+            for axis in range(3):
+                right[n, order, axis] += by_ends[n, 1 + order, axis] * unit
+                right[n + 1, order, axis] += by_ends[n, 5 + order, axis] * unit
+    adjoint = solve_adjoint(points, times, right, known, count)
     ends, factors = ends_of(points, times, derivatives), ends_of(np.zeros_like(points), times, adjoint)
-    by_times = (_POWERS[:, None] * by_ends * ends).sum(axis=(1, 2)) / times
-    stiffness = times**-7.0
-    by_energy = ENERGY * (_POWERS[:, None] + _POWERS - 7)
-    by_times -= ((factors * (by_energy @ ends)).sum(axis=(1, 2))) * stiffness / times
-    by_step = by_ends[:, 4] - (factors * ENERGY[:, 4, None]).sum(axis=1) * stiffness[:, None]
-    by_points = np.zeros_like(points)
-    by_points[:-1] += by_left - by_step
-    by_points[1:] += by_step
+    by_times, by_points = np.zeros(count), np.zeros_like(points)
+    for n in range(count):
+        stiffness = times[n] ** -7.0
+        for axis in range(3):
+            by_step, scaled = by_ends[n, 4, axis], 0.0
+            for row in range(8):
+                power = row % 4
+                factor = factors[n, row, axis] * stiffness
+                scaled += power * by_ends[n, row, axis] * ends[n, row, axis]
+                by_step -= factor * ENERGY[row, 4]
+                for column in range(8):
+                    scaled -= factor * ENERGY[row, column] * (power + column % 4 - 7) * ends[n, column, axis]
+            by_times[n] += scaled / times[n]
+            by_points[n, axis] += by_left[n, axis] - by_step
+            by_points[n + 1, axis] += by_step
     return by_times, by_points
 
 
+@njit(error_model="numpy")
 def ends_of(points: NDArray, times: NDArray, derivatives: NDArray) -> NDArray:
     """Return (K-1, 8, 3), values at both ends of each piece, in units of its time, from its left point on."""
-    units = times[:, None] ** np.arange(1, 4)
     ends = np.zeros((len(times), 8, 3))
-    ends[:, 4] = np.diff(points, axis=0)
-    ends[:, 1:4], ends[:, 5:] = derivatives[:-1] * units[..., None], derivatives[1:] * units[..., None]
+    for n in range(len(times)):
+        unit = 1.0
+        for order in range(3):
+            unit *= times[n]
+            for axis in range(3):
+                ends[n, 1 + order, axis] = derivatives[n, order, axis] * unit
+                ends[n, 5 + order, axis] = derivatives[n + 1, order, axis] * unit
+        for axis in range(3):
+            ends[n, 4, axis] = points[n + 1, axis] - points[n, axis]
     return ends
-
-
-def _by_derivatives(times: NDArray, by_ends: NDArray) -> NDArray:
-    """Return the gradient by γ' to γ''' at the points, (K, 3, 3), from that by the ends of pieces."""
-    units = times[:, None] ** np.arange(1, 4)
-    by_derivatives = np.zeros((len(times) + 1, 3, 3))
-    by_derivatives[:-1] += by_ends[:, 1:4] * units[..., None]
-    by_derivatives[1:] += by_ends[:, 5:] * units[..., None]
-    return by_derivatives
 
 
 @njit(error_model="numpy")

@@ -86,6 +86,18 @@ def glitch_at_sampled_setpoints(
 
     The same holds near the worst of them. Arguments as for glitch_at_every_setpoint.
     """
+    return _sampled(payloads, limits, rate, start, _NEAR_WORST)
+
+
+def glitch_near_critical_setpoints(
+    payloads: NDArray, limits: Limits, rate: float = RATE, *, start: NDArray | None = None
+) -> GlitchMoments:
+    """Let a gap begin like glitch_at_sampled_setpoints(); if none nearly loses the vehicle, the worst is not found."""
+    return _sampled(payloads, limits, rate, start, -math.inf)
+
+
+def _sampled(payloads: NDArray, limits: Limits, rate: float, start: NDArray | None, near_worst: float) -> GlitchMoments:
+    """Simulate all setpoints near samples with a usage of CRITICAL_USAGE, or `near_worst` below the largest."""
     flight = _fly_without(payloads, limits, rate, GAP, start)
     wanted: NDArray = _wanted(len(payloads), limits)
     first = _every(len(payloads), SAMPLED_EVERY) & wanted.any(axis=1, keepdims=True)
@@ -93,7 +105,7 @@ def glitch_at_sampled_setpoints(
     moments = flight.moments(found, limits, rate)
     usage = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
     usage[moments.lost.any(axis=0)] = np.inf
-    more = wanted & ~first & ~(usage < min(CRITICAL_USAGE, usage.max() - _NEAR_WORST))
+    more = wanted & ~first & ~(usage < min(CRITICAL_USAGE, usage.max() - near_worst))
     return flight.moments(np.fmax(found, _gaps(flight, more, limits, GAP)), limits, rate)
 
 

@@ -22,6 +22,7 @@ from cfplan.simulation.glitches import (
     WITHOUT_POSES_EVERY,
     glitch_at_every_setpoint,
     glitch_at_sampled_setpoints,
+    glitch_near_critical_setpoints,
 )
 
 REPOSITORY = Path(__file__).parents[2]
@@ -126,6 +127,20 @@ def test_sampled_gaps_say_the_same_where_the_vehicle_is_nearly_lost_and_little_l
     assert 0 < np.count_nonzero(nearly) < len(line)
     np.testing.assert_array_equal(sampled.deviation[:, nearly], found.deviation[:, nearly])
     np.testing.assert_array_equal(sampled.tilt[:, nearly], found.tilt[:, nearly])
+
+
+def test_gaps_near_critical_setpoints_are_the_same_where_the_vehicle_is_nearly_lost(found, line, limits):
+    cut = found.deviation.max() / 0.9
+    strict = replace(limits, flight=replace(limits.flight, deviation=replace(limits.flight.deviation, cut=cut)))
+    some = glitch_near_critical_setpoints(line, strict)
+    nearly = (np.fmax(found.deviation / cut, found.tilt / TURNED_OVER) > CRITICAL_USAGE + 0.15).any(axis=0)
+    assert 0 < np.count_nonzero(nearly) < len(line)
+    np.testing.assert_array_equal(some.deviation[:, nearly], found.deviation[:, nearly])
+    np.testing.assert_array_equal(some.tilt[:, nearly], found.tilt[:, nearly])
+    lost = replace(
+        strict, flight=replace(strict.flight, deviation=replace(strict.flight.deviation, cut=0.9 * cut / 1.1))
+    )
+    assert glitch_near_critical_setpoints(line, lost).lost.any()
 
 
 def test_a_vehicle_that_turns_over_is_lost(line, limits):

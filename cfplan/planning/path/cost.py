@@ -23,7 +23,6 @@ from cfplan.planning.path.room import Room
 from cfplan.planning.path.variables import ChoiceVariables, Knots
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import distances_beyond, inside
-from cfplan.vehicle.profile import BoundaryState
 
 NODES_PER_METRE, NODES_PER_PIECE, LEAST_NODES = 4, 4, 60  # of the expert's grid while a path is chosen
 STILL = 1e-3  # of the nominal speed, below which a path stands still
@@ -40,7 +39,6 @@ class Course:
     regions: tuple[Region, ...]  # one for each waypoint
     yaw: YawMode
     yaw_angle: float  # rad
-    start: BoundaryState | None = None  # state in which it begins; None: at rest
 
 
 @dataclass(slots=True, eq=False)
@@ -78,7 +76,7 @@ class PathCost:
         """Return the flight time, s, and its derivatives, (5, 3, P), by the path at some places, (P,)."""
         task = PlanningTask(
             path, self.limits.airframe, self.limits.plan, nodes=self.nodes, yaw=self.course.yaw,
-            yaw_angle=self.course.yaw_angle, start=self.course.start, deadline=self.deadline,
+            yaw_angle=self.course.yaw_angle, deadline=self.deadline,
         )  # fmt: skip
         flown = sensitivity(task, self.near)
         if flown is None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.deadline import Deadline
+from cfplan.machine_code import njit
 
 _REMEMBERED = 12  # steps, and changes of the gradient over them
 _ARMIJO = 1e-4
@@ -28,17 +29,16 @@ class Descended(NamedTuple):
 def descend(cost: Cost, x: NDArray, deadline: Deadline, *, tolerance: float, iterations: int) -> Descended:
     """Descend from x, (n,), until two steps in a row improve the cost by less than a fraction, `tolerance`."""
     value, gradient = cost(x)
-    steps: list[NDArray] = []
-    changes: list[NDArray] = []
+    steps = changes = np.empty((0, len(x)))
     small = 0
     for _ in range(iterations if value < math.inf else 0):
         direction = _direction(gradient, steps, changes)
         if not direction @ gradient < 0.0:
-            steps, changes, direction = [], [], -gradient
+            steps, changes, direction = steps[:0], changes[:0], -gradient
         largest = float(np.abs(direction).max(initial=0.0))
         if largest == 0.0:
             break
-        share = min(1.0, _LONGEST / largest) if steps else 0.5 * _LONGEST / largest
+        share = min(1.0, _LONGEST / largest) if len(steps) else 0.5 * _LONGEST / largest
         for _ in range(_HALVINGS):
             if deadline.passed:
                 return Descended(x, value, False)
@@ -48,13 +48,13 @@ def descend(cost: Cost, x: NDArray, deadline: Deadline, *, tolerance: float, ite
                 break
             share *= 0.3
         else:
-            if not steps:
+            if not len(steps):
                 break
-            steps, changes = [], []  # restart with the gradient itself
+            steps, changes = steps[:0], changes[:0]  # restart with the gradient itself
             continue
         step, change = there - x, gradient_there - gradient
         if step @ change > 1e-10 * float(np.linalg.norm(step) * np.linalg.norm(change)):
-            steps, changes = [*steps, step][-_REMEMBERED:], [*changes, change][-_REMEMBERED:]
+            steps, changes = (np.vstack(each)[-_REMEMBERED:] for each in ((steps, step), (changes, change)))
         small = small + 1 if value - value_there < tolerance * value else 0
         x, value, gradient = there, value_there, gradient_there
         if small == 2:
@@ -62,16 +62,19 @@ def descend(cost: Cost, x: NDArray, deadline: Deadline, *, tolerance: float, ite
     return Descended(x, value, not deadline.passed)
 
 
-def _direction(gradient: NDArray, steps: list[NDArray], changes: list[NDArray]) -> NDArray:
-    """Return the direction of the next step (Nocedal and Wright, "Numerical Optimization", algorithm 7.4)."""
-    direction = -gradient
-    shares = []
-    for step, change in zip(reversed(steps), reversed(changes), strict=True):
-        share = (step @ direction) / (step @ change)
-        direction = direction - share * change
-        shares.append(share)
-    if steps:
-        direction = direction * ((steps[-1] @ changes[-1]) / (changes[-1] @ changes[-1]))
-    for step, change, share in zip(steps, changes, reversed(shares), strict=True):
-        direction = direction + step * (share - (change @ direction) / (step @ change))
-    return np.asarray(direction)
+@njit(error_model="numpy")
+def _direction(gradient: NDArray, steps: NDArray, changes: NDArray) -> NDArray:
+    """Return the direction of the next step (Nocedal and Wright, "Numerical Optimization", algorithm 7.4).
+
+    `steps`, (K, n), are the last steps, the oldest first, and `changes` those of the gradient over them.
+    """
+    direction, count = -gradient, len(steps)
+    shares, curvatures = np.empty(count), (steps * changes).sum(axis=1)
+    for k in range(count - 1, -1, -1):
+        shares[k] = (steps[k] * direction).sum() / curvatures[k]
+        direction -= shares[k] * changes[k]
+    if count:
+        direction *= curvatures[-1] / (changes[-1] ** 2).sum()
+    for k in range(count):
+        direction += steps[k] * (shares[k] - (changes[k] * direction).sum() / curvatures[k])
+    return direction
