@@ -6,7 +6,7 @@ from cfplan.flight.setpoints.encoding import EncodedFlight
 from cfplan.numbers import coordinates
 from cfplan.preparation.local_slowing import Assessment
 from cfplan.safety.limits import Limits
-from cfplan.simulation.glitches import GAP, KINDS, TURNED_OVER, glitch_at_sampled_setpoints
+from cfplan.simulation.glitches import GAP, KINDS, glitch_at_sampled_setpoints
 
 KEPT = 0.9  # usage that planning keeps; at 1 the vehicle counts as lost
 _ABOUT = (0.0, GAP + 0.3)  # s before and after a setpoint at fault, to be slowed: the gap, and the catching up
@@ -15,10 +15,9 @@ _HINT = "make the path gentler there, or plan with a lower speed or acceleration
 
 def assess_glitches(encoded: EncodedFlight, limits: Limits) -> Assessment:
     """Simulate a gap at each setpoint; one is at fault if deviation or tilt nearly lose the vehicle."""
-    moments, cut = glitch_at_sampled_setpoints(encoded.payloads, limits), limits.flight.deviation.cut
-    shares = np.fmax(moments.deviation / cut, moments.tilt / TURNED_OVER)  # (3, N), 1: lost
-    shares[moments.lost & ~(shares >= 1.0)] = np.inf
-    kind, share = np.argmax(shares, axis=0), shares.max(axis=0)
+    moments = glitch_at_sampled_setpoints(encoded.payloads, limits)
+    usage = moments.usage(limits)
+    kind, share = np.argmax(usage, axis=0), usage.max(axis=0)
 
     def describe(at: int) -> str:
         off, tilt = moments.deviation[kind[at], at], np.degrees(moments.tilt[kind[at], at])

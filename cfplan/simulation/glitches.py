@@ -1,10 +1,13 @@
 """Glitch margin: the effect of a gap in setpoints, in poses, or in both, beginning at any setpoint.
 
-The flight of the nominal vehicle is simulated once and branches off at each setpoint; its estimate of position and
-velocity is late all the time. During the gap the vehicle keeps its last setpoint; without poses it flies on by
-gyroscope and accelerometer, and an error of its attitude makes the estimate drift. After the gap, the setpoints that
-are due by the clock arrive again, and poses. The vehicle is lost if it then deviates so far that the pilot would cut
-its motors, or tilts so far that it turns over.
+The flight is simulated once and branches off at each setpoint; the estimate of position and velocity is late all the
+time. Where the gap brings the nominal vehicle near its loss, one with slower motors and a stronger one fly too, each by
+the airframe's spread, and the worst counts.
+
+During the gap the vehicle keeps its last setpoint; without poses it flies on by gyroscope and accelerometer, and an
+error of its attitude makes the estimate drift. After the gap, the setpoints that are due by the clock arrive again, and
+poses. The vehicle is lost if it then deviates so far that the pilot would cut its motors, or tilts so far that it turns
+over.
 
 In 0.2 s an attitude error of 1° makes an error of 3 cm/s in the estimate, which adds less than 3 cm to the effect of a
 gap in setpoints. So gaps in poses begin at every fifth setpoint only; between two of these the worse one counts, if it
@@ -13,7 +16,7 @@ far from lost; there too the worse of two counts between them.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,11 +29,11 @@ from cfplan.safety.limits import Limits
 from cfplan.simulation.engine.flight import NO_FLOOR
 from cfplan.simulation.engine.layout import POSITION, QUATERNION, hovering_snapshot, pack_airframe, setpoint_rows
 from cfplan.simulation.engine.run import Schedule, Vehicles, arrival_times, simulate
-from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
-LATENCY = 10  # ms by which the estimate is late; in dry runs positions are up to 6 and velocities up to 9 ms late
+LATENCY = 0.010  # s by which the estimate is late; in dry runs positions are up to 6 and velocities up to 9 ms late
 AFTERWARDS = 2.0  # s simulated after the gap: at little thrust a vehicle may stray for 1.5 s until it is lost
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")
@@ -40,6 +43,7 @@ CRITICAL_USAGE = (
     0.6  # usage above which it is not far; in 26 flights up to 3 m/s it rose by at most 0.15 between samples
 )
 _NEAR_WORST = 0.03  # usage; around samples this close to the worst one every setpoint is simulated
+_LATENCY_MS = round(1000 * LATENCY)
 _STEP = 2  # ms, of the simulation from the gap on: steps of 4 ms underestimate saturation of the motors
 
 
@@ -51,6 +55,11 @@ class GlitchMoments:
     deviation: NDArray  # (3, N) m, largest distance from the setpoints that are due, from the gap on
     tilt: NDArray  # (3, N) rad, largest from the gap on
     lost: NDArray  # (3, N) bool, whether the vehicle is lost
+
+    def usage(self, limits: Limits) -> NDArray:
+        """Return (3, N): deviation or tilt as a fraction of what loses the vehicle; at least 1 if it is lost."""
+        share = np.fmax(self.deviation / limits.flight.deviation.cut, self.tilt / TURNED_OVER)
+        return np.where(self.lost & ~(share >= 1.0), np.inf, share)
 
     @property
     def worst(self) -> tuple[str, int]:
@@ -75,8 +84,9 @@ def glitch_at_every_setpoint(
 
     The flight begins in hover, or from the snapshot `start`, (31,), of another at the same setpoint.
     """
-    flight = _fly_without(payloads, limits, rate, gap, start)
-    return flight.moments(_gaps(flight, _wanted(len(payloads), limits), limits, gap), limits, rate)
+    flight = _fly_without(payloads, limits, limits.airframe, rate, gap, start)
+    nominal = flight.moments(_gaps(flight, _wanted(len(payloads), limits), limits, gap), limits, rate)
+    return _with_others(nominal, payloads, limits, rate, gap, start)
 
 
 def glitch_at_sampled_setpoints(
@@ -98,15 +108,44 @@ def glitch_near_critical_setpoints(
 
 def _sampled(payloads: NDArray, limits: Limits, rate: float, start: NDArray | None, near_worst: float) -> GlitchMoments:
     """Simulate all setpoints near samples with a usage of CRITICAL_USAGE, or `near_worst` below the largest."""
-    flight = _fly_without(payloads, limits, rate, GAP, start)
+    flight = _fly_without(payloads, limits, limits.airframe, rate, GAP, start)
     wanted: NDArray = _wanted(len(payloads), limits)
     first = _every(len(payloads), SAMPLED_EVERY) & wanted.any(axis=1, keepdims=True)
     found = _gaps(flight, first, limits, GAP)
-    moments = flight.moments(found, limits, rate)
-    usage = np.fmax(moments.deviation / limits.flight.deviation.cut, moments.tilt / TURNED_OVER).max(axis=0)
-    usage[moments.lost.any(axis=0)] = np.inf
+    usage = flight.moments(found, limits, rate).usage(limits).max(axis=0)
     more = wanted & ~first & ~(usage < min(CRITICAL_USAGE, usage.max() - near_worst))
-    return flight.moments(np.fmax(found, _gaps(flight, more, limits, GAP)), limits, rate)
+    nominal = flight.moments(np.fmax(found, _gaps(flight, more, limits, GAP)), limits, rate)
+    return _with_others(nominal, payloads, limits, rate, GAP, start)
+
+
+def _with_others(
+    nominal: GlitchMoments, payloads: NDArray, limits: Limits, rate: float, gap: float, start: NDArray | None
+) -> GlitchMoments:
+    """Return the worst of all vehicles; the others fly only where the nominal one is near its loss."""
+    critical = nominal.usage(limits).max(axis=0) >= CRITICAL_USAGE
+    if not critical.any():
+        return nominal
+    worst = nominal
+    wanted = _wanted(len(payloads), limits) & (critical | _every(len(payloads), len(payloads)))
+    for airframe in _others(limits.airframe):
+        flight = _fly_without(payloads, limits, airframe, rate, gap, start)
+        found = flight.moments(_gaps(flight, wanted, limits, gap), limits, rate)
+        worst = GlitchMoments(
+            worst.time,
+            np.where(critical, np.fmax(worst.deviation, found.deviation), worst.deviation),
+            np.where(critical, np.fmax(worst.tilt, found.tilt), worst.tilt),
+            worst.lost | (critical & found.lost),
+        )
+    return worst
+
+
+def _others(airframe: Airframe) -> tuple[Airframe, Airframe]:
+    """Return the vehicles that a gap loses soonest: of 32 drawn ones, those with slow motors or much thrust."""
+    spread = airframe.spread
+    return (
+        replace(airframe, motor_time_constant=(1.0 + spread.motor_time_constant) * airframe.motor_time_constant),
+        replace(airframe, thrust_scale=(1.0 + spread.thrust_scale) * airframe.thrust_scale),
+    )
 
 
 def _wanted(count: int, limits: Limits) -> NDArray:
@@ -124,6 +163,7 @@ def _every(count: int, step: int) -> NDArray:
 class _Flight(NamedTuple):
     """A flight without a gap."""
 
+    airframe: NDArray  # (26,) as a batch holds it
     rows: NDArray  # (N, 20) setpoints, as the controller takes them
     arrivals: NDArray  # (N,) ms
     snapshots: NDArray  # (N, 31) when they arrive
@@ -149,24 +189,26 @@ class _Flight(NamedTuple):
         return GlitchMoments(number / rate, deviation, tilt, ~kept)
 
 
-def _fly_without(payloads: NDArray, limits: Limits, rate: float, gap: float, start: NDArray | None) -> _Flight:
-    """Fly without a gap; from each setpoint, evaluate as long a time as for a gap of `gap`, s."""
+def _fly_without(
+    payloads: NDArray, limits: Limits, airframe: Airframe, rate: float, gap: float, start: NDArray | None
+) -> _Flight:
+    """Fly a vehicle without a gap; from each setpoint, evaluate as long a time as for a gap of `gap`, s."""
     from scipy.ndimage import maximum_filter1d  # slow to import
 
     state, first, watched = decode(payloads), np.zeros(1, dtype=np.int64), round(1000 * (gap + AFTERWARDS))
     rows, arrivals = setpoint_rows(state), arrival_times(len(payloads), rate)
-    begin = hovering_snapshot(limits.airframe, state) if start is None else start
-    packed = pack_airframe(limits.airframe, floor=NO_FLOOR)[None]
-    batch = Vehicles(begin[None], packed, first, first + len(rows) - 1, first, np.zeros((1, 3)))
+    begin = hovering_snapshot(airframe, state) if start is None else start
+    packed = pack_airframe(airframe, floor=NO_FLOOR)
+    batch = Vehicles(begin[None], packed[None], first, first + len(rows) - 1, first, np.zeros((1, 3)))
     steps, gains = int(arrivals[-1]) + watched + 1, gains_for(limits.airframe).pack()
-    schedule = Schedule(rows, arrivals, gains, steps=steps, latency=LATENCY)
+    schedule = Schedule(rows, arrivals, gains, steps=steps, latency=_LATENCY_MS)
     flown = simulate(batch, schedule, arrived=len(rows), trace=True)
     moved = flown.trace[0, 1:]
     due = rows[np.searchsorted(arrivals, np.arange(len(moved)), side="right") - 1, :3]
     each = np.stack([np.linalg.norm(moved[:, POSITION] - due, axis=1), tilt_of(moved[:, QUATERNION].T)])
     # The filter's window begins at each moment.
     worst = maximum_filter1d(np.where(np.isfinite(each), each, np.inf), watched, axis=1, origin=-(watched // 2))
-    return _Flight(rows, arrivals, flown.arrived[0], worst[:, arrivals])
+    return _Flight(packed, rows, arrivals, flown.arrived[0], worst[:, arrivals])
 
 
 def _gaps(flight: _Flight, wanted: NDArray, limits: Limits, gap: float) -> NDArray:
@@ -180,13 +222,14 @@ def _gaps(flight: _Flight, wanted: NDArray, limits: Limits, gap: float) -> NDArr
     ahead = np.where(speed > 0.0, snapshots[:, 3:5] / np.where(speed > 0.0, speed, 1.0), (1.0, 0.0))
     push = GRAVITY * math.tan(estimate_errors(limits)[0]) * (kind != 0)[:, None]
     batch = Vehicles(
-        snapshots, np.tile(pack_airframe(limits.airframe, floor=NO_FLOOR), (len(kind), 1)), number,
+        snapshots, np.tile(flight.airframe, (len(kind), 1)), number,
         np.full(len(kind), len(flight.rows) - 1), np.where(kind == 1, 0, milliseconds),
         np.concatenate([push * ahead, np.zeros((len(kind), 1))], axis=1),
     )  # fmt: skip
     schedule = Schedule(
         flight.rows, flight.arrivals, gains_for(limits.airframe).pack(),
-        steps=(milliseconds + round(1000 * AFTERWARDS)) // _STEP, step=_STEP, blind_until=milliseconds, latency=LATENCY,
+        steps=(milliseconds + round(1000 * AFTERWARDS)) // _STEP, step=_STEP, blind_until=milliseconds,
+        latency=_LATENCY_MS,
     )  # fmt: skip
     found, worst = simulate(batch, schedule), np.full((2, *wanted.shape), np.nan)
     worst[:, kind, number] = np.nan_to_num((found.deviation, found.tilt), nan=np.inf)  # NaN: not simulated

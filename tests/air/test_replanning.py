@@ -62,7 +62,7 @@ def test_simulated_on_from_a_snapshot_a_flight_is_the_whole_flight(held, limits)
     np.testing.assert_allclose(
         glitch_at_every_setpoint(payloads[begin:], limits, start=believed).deviation,
         gaps.deviation[:, begin:],
-        atol=limits.plan.speed * LATENCY / 1000,
+        atol=limits.plan.speed * LATENCY,
     )
     flown, later = held.motion, held.motion.since(begin / RATE)
     at_once = fly_motion(

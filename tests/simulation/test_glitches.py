@@ -26,7 +26,7 @@ from cfplan.simulation.glitches import (
 )
 
 REPOSITORY = Path(__file__).parents[2]
-LATE = Conditions(estimate=EstimateErrors(latency=LATENCY / 1000))
+LATE = Conditions(estimate=EstimateErrors(latency=LATENCY))
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def test_without_poses_a_right_attitude_flies_on_as_the_dry_run_does(line, limit
 def test_a_flight_without_a_gap_stays_on_its_setpoints(line, limits):
     """It flies ahead by its speed times the lateness of its estimate."""
     without = glitch_at_every_setpoint(line, limits, gap=0.0)
-    assert without.deviation.max() < 0.03 + limits.plan.speed * LATENCY / 1000
+    assert without.deviation.max() < 0.03 + limits.plan.speed * LATENCY
     assert not without.lost.any()
 
 
@@ -103,7 +103,7 @@ def test_without_poses_a_wrong_attitude_carries_the_vehicle_off(line, limits):
         return glitch_at_every_setpoint(line, wrong).deviation[1]
 
     right, wrong = poses_missing(0.0), poses_missing(3.0)
-    assert right.max() < 0.03 + limits.plan.speed * LATENCY / 1000
+    assert right.max() < 0.03 + limits.plan.speed * LATENCY
     assert 0.005 < (wrong - right).max() < 0.1  # 0.5 m/s² for 0.2 s is 1 cm, and 10 cm/s to be taken back
 
 
