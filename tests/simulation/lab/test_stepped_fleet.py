@@ -49,15 +49,20 @@ def mission(y: float) -> Mission:
 MISSIONS = {"left": mission(0.0), "right": mission(0.45)}
 
 
-OWN = {  # they do not arm themselves, so that the last state says whether they were disarmed
-    name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
-    for name, each in MISSIONS.items()
-}
+def standing(missions):
+    """Each under its start; they do not arm themselves, so that the last state says whether they were disarmed."""
+    return {
+        name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
+        for name, each in missions.items()
+    }
 
 
-def fleet_of(missions=MISSIONS, settings=None, delays=None):
+OWN = standing(MISSIONS)
+
+
+def fleet_of(missions=MISSIONS, delays=None):
     flights = [ConductedFlight(name, each.start[0], (delays or {}).get(name, 0.0)) for name, each in missions.items()]
-    return SteppedFleet(missions, Conductor(flights, APART), settings=settings or OWN)
+    return SteppedFleet(missions, Conductor(flights, APART), settings=standing(missions))
 
 
 def streaming(fleet, name, moment, act):
@@ -221,8 +226,7 @@ def nearest_after(flight, begin):
 def test_vehicles_beside_a_wall_keep_apart_when_all_poses_are_lost():
     """One alone would move 0.4 m off the wall at y = 4, to where the other is."""
     missions = {"left": mission(2.95), "right": mission(3.35)}
-    settings = {name: replace(OWN[name], position=(*each.start[0][:2], 0.0)) for name, each in missions.items()}
-    fleet = fleet_of(missions, settings)
+    fleet = fleet_of(missions)
     flight = fleet.fly(streaming(fleet, "left", 0.8, lambda: lose_all_poses(fleet)))
     assert_down(flight)
     assert nearest_after(flight, begun(flight)["left"]) > APART
@@ -240,7 +244,7 @@ def two():
 def test_two_vehicles_whose_poses_all_stop_come_no_nearer_than_certified(two, moment):
     planned, missions = two
     flights = [ConductedFlight(each.name, missions[each.name].start[0], each.delay) for each in planned.members]
-    fleet = SteppedFleet(missions, Conductor(flights, planned.apart))
+    fleet = SteppedFleet(missions, Conductor(flights, planned.apart), settings=standing(missions))
     first = min(planned.members, key=lambda each: each.delay).name
     flight = fleet.fly(streaming(fleet, first, moment, lambda: lose_all_poses(fleet)))
     assert_down(flight)
