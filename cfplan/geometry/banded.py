@@ -78,12 +78,21 @@ def solve_regularised(matrix, right, regularised):
 def solve_definite(matrix: NDArray, right: NDArray) -> NDArray:
     """Return the solution for right sides, (size, K), of a positive definite matrix, (size, width).
 
-    Raises LinAlgError unless the matrix is positive definite beyond rounding.
+    Rows and columns may differ by many decades, as they are first scaled to a diagonal of ones.
+
+    Raises LinAlgError unless the scaled matrix is positive definite beyond rounding.
     """
-    solution, definite = solve_columns(np.ascontiguousarray(matrix), np.ascontiguousarray(right))
+    diagonal = matrix[:, 0]
+    if not diagonal.min() > 0.0:
+        raise np.linalg.LinAlgError("the matrix is not positive definite")
+    scale = 1.0 / np.sqrt(diagonal)
+    scaled = scale[:, None] * matrix
+    for d in range(matrix.shape[1]):
+        scaled[d:, d] *= scale[: len(scale) - d]
+    solution, definite = solve_columns(scaled, scale[:, None] * right)
     if not definite:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
-    return np.asarray(solution)
+    return np.asarray(scale[:, None] * solution)
 
 
 @njit(error_model="numpy")

@@ -2,9 +2,9 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from functools import lru_cache
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pyarrow as pa
@@ -36,16 +36,13 @@ ACTIVE_SHARE = 0.98  # of a limit, from which it counts as active
 ChoosePath = Callable[[NDArray, Space, LimitSet, YawMode, float], Path]
 """From waypoints, (K, 3) m, their room, vehicle and limits, and yaw with its angle, rad, to the path to be flown."""
 
-_NUMBERS = pa.list_(pa.float64())
-_TYPES = {
-    str(float): pa.float64(),
-    str(str): pa.string(),
-}  # of an airframe's and of limits' fields; the rest are several numbers
+_TYPES = {float: pa.float64(), str: pa.string()}
+_NUMBERS = pa.list_(pa.float64())  # of all other fields of airframes and limits
 
 
-def _fields_of(kind: Any, without: frozenset[str] = frozenset()) -> pa.DataType:
-    kept = [field for field in fields(kind) if field.name not in without]
-    return pa.struct([(field.name, _TYPES.get(str(field.type), _NUMBERS)) for field in kept])
+def _fields_of(kind: type, without: frozenset[str] = frozenset()) -> pa.DataType:
+    types = get_type_hints(kind)
+    return pa.struct([(name, _TYPES.get(types[name], _NUMBERS)) for name in types if name not in without])
 
 
 SCHEMA = pa.schema(

@@ -6,24 +6,26 @@ from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StrictBool, StringConstraints
+from annotated_types import Ge, Gt, Le, Len, Lt
+from pydantic import StringConstraints
 
 from cfplan.errors import CfplanError, InputError
+from cfplan.files.schema import Keys, read_as, schema_of
 from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_places
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
-    BatteryLimits,
+    LARGEST_IN_PACKET,
+    Encodable,
     FirmwareSettings,
     FlightLimits,
-    GroundManoeuvres,
     Ladder,
     Limits,
     LinkLossLimits,
     PlanLimits,
-    PoseLimits,
+    Positive,
     within_reserve,
 )
 from cfplan.safety.quantities import ON_LADDER
@@ -32,7 +34,6 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.airframes import load_airframe
 
 DEFAULTS = Path(__file__).with_name("defaults.yaml")  # a complete safety.yaml, with comments
-LARGEST_IN_PACKET = 32.767  # m, m/s, m/s², rad/s: range of a setpoint's 16 bits, in thousandths
 
 _PLANNING_MINIMA = {
     "speed": 0.02,
@@ -46,134 +47,50 @@ _LOOKED_AT = 65  # grid points along each side of the room, for places to take o
 
 _QUARTER_TURN = math.pi / 2  # a tilt limit below this many degrees is taken for radians
 
-Positive = Annotated[float, Field(gt=0.0, le=1000.0)]
-Encodable = Annotated[float, Field(gt=0.0, le=LARGEST_IN_PACKET)]
-_MotorLag = Annotated[float, Field(ge=0.005, le=0.5)]
-Share = Annotated[float, Field(gt=0.0, lt=0.5)]
-Voltage = Annotated[float, Field(ge=2.5, le=4.35)]
-Coordinate = Annotated[float, Field(ge=-LARGEST_IN_PACKET, le=LARGEST_IN_PACKET)]
+Coordinate = Annotated[float, Ge(-LARGEST_IN_PACKET), Le(LARGEST_IN_PACKET)]
 Corner = tuple[Coordinate, Coordinate, Coordinate]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class _Plan(_Section):
-    speed: Encodable
-    acceleration: Encodable
-    angular_velocity: Encodable
-    angular_acceleration: Positive
-    tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
-    motor_reserve: Share
-    specific_thrust: Positive
-
-
-class _Ladder(_Section):
-    brake: Positive
-    land: Positive
-    cut: Positive
-
-
-class _Flight(_Section):
-    deviation: _Ladder
-    fence: _Ladder
-    speed: _Ladder
-    acceleration: _Ladder
-    angular_velocity: _Ladder
-    patience: Annotated[float, Field(gt=0.0, le=1.0)]
-    stop_tilt_deg: Annotated[float, Field(gt=0.0, lt=90.0)]
-
-    @classmethod
-    def ladders(cls) -> list[str]:
-        """Return the names of the ladders."""
-        return [name for name, field in cls.model_fields.items() if field.annotation is _Ladder]
-
-
-class _Box(_Section):
+class _Box(Keys):
     low: Corner
     high: Corner
-    yaw_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    yaw_deg: Annotated[float, Ge(-360.0), Le(360.0)] = 0.0
 
 
-class _Cylinder(_Section):
+class _Cylinder(Keys):
     x: Coordinate
     y: Coordinate
     radius: Encodable
     height: Encodable
 
 
-class _Obstacle(_Section):
-    name: Annotated[str, StringConstraints(min_length=1, max_length=40)] = ""
+class _Obstacle(Keys):
+    name: Annotated[str, Len(1, 40)] = ""
     box: _Box | None = None
     cylinder: _Cylinder | None = None
 
 
-class _Space(_Section):
+class _Space(Keys):
     low: Corner
     high: Corner
     margin: Positive
-    obstacles: Annotated[tuple[_Obstacle, ...], Field(max_length=1000)]
-
-
-class _Battery(_Section):
-    at_rest: Voltage
-    under_load: Voltage
-    under_load_seconds: Annotated[float, Field(gt=0.0, le=10.0)]
-    endurance: Annotated[float, Field(gt=0.0, le=3600.0)]
-
-
-class _Pose(_Section):
-    rate: Positive
-    rate_min: Positive
-    latency: Annotated[float, Field(ge=0.0, le=0.2)]
-    age_warning: Annotated[float, Field(gt=0.0, le=1.0)]
-    age_brake: Annotated[float, Field(gt=0.0, le=1.0)]
-    age_land: Annotated[float, Field(gt=0.0, le=2.0)]
-    jump: Annotated[float, Field(gt=0.0, le=1.0)]
-    agreement: Annotated[float, Field(gt=0.0, le=1.0)]
-    yaw_agreement_deg: Annotated[float, Field(gt=0.0, le=90.0)]
-    position_noise: Annotated[float, Field(gt=0.0, le=0.1)]
-    attitude_noise_deg: Annotated[float, Field(gt=0.0, le=10.0)]
-
-
-class _LinkLoss(_Section):
-    outside: Literal["refuse", "warn"]
-    motor_lags: Annotated[tuple[_MotorLag, ...], Field(min_length=1, max_length=5)]
-    attitude_error_deg: Annotated[float, Field(ge=0.0, le=10.0)]
-    vertical_acceleration_error: Annotated[float, Field(ge=0.0, le=2.0)]
-    velocity_error: Annotated[float, Field(ge=0.0, le=1.0)]
+    obstacles: Annotated[tuple[_Obstacle, ...], Len(0, 1000)]
 
 
 _Version = Annotated[str, StringConstraints(pattern=r"^\d{4}\.\d{1,2}(\.\d{1,3})?$")]
 
-
-class _Firmware(_Section):
-    controller: Annotated[int, Field(ge=1, le=6)]
-    estimator: Annotated[int, Field(ge=1, le=3)]
-    oldest: _Version
-    newest: _Version
-    watchdog: StrictBool
-
-
-class _Ground(_Section):
-    take_off_height: Annotated[float, Field(gt=0.0, le=5.0)]
-    take_off_speed: Annotated[float, Field(gt=0.0, le=1.0)]
-    go_to_speed: Annotated[float, Field(gt=0.0, le=2.0)]
-    land_speed: Annotated[float, Field(gt=0.0, le=1.0)]
-
-
-class _SafetyFile(_Section):
-    vehicle: Annotated[str, Field(min_length=1, max_length=200)]
-    plan: _Plan
-    flight: _Flight
-    space: _Space
-    battery: _Battery
-    pose: _Pose
-    link_loss: _LinkLoss
-    firmware: _Firmware
-    ground: _Ground
-    lateness: Annotated[float, Field(gt=0.0, le=0.1)]
+_SafetyFile: Any = schema_of(
+    Limits,
+    airframe=None,  # it has a file of its own
+    vehicle=Annotated[str, Len(1, 200)],
+    plan=schema_of(
+        PlanLimits, angular_acceleration=Positive, motor_thrust_min=None, motor_thrust_max=None,
+        specific_thrust_min=None, motor_reserve=Annotated[float, Gt(0.0), Lt(0.5)], specific_thrust=Positive,
+    ),
+    space=_Space,
+    firmware=schema_of(FirmwareSettings, oldest=_Version, newest=_Version),
+    link_loss=schema_of(LinkLossLimits, only_warn=None, outside=Literal["refuse", "warn"]),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,12 +106,14 @@ def all_keys() -> tuple[Key, ...]:
     """Return every key that safety.yaml may have, in the order of the file; a ladder with its three rungs is one."""
     schema = _SafetyFile.model_json_schema()
     definitions, defaults, found = schema["$defs"], _defaults(), []
-    for name, kind in schema["properties"].items():
+    for name, written in read_plain(DEFAULTS).items():
+        kind = schema["properties"][name]
         section = definitions.get(kind.get("$ref", "").split("/")[-1])
         if section is None:
             found.append(Key(name, defaults.get(name), _range(kind)))
             continue
-        for key, value in section["properties"].items():
+        for key in written:
+            value = section["properties"][key]
             rungs = definitions.get(value.get("$ref", "").split("/")[-1], {}).get("properties")
             words = f"each {_range(rungs['brake'])}" if rungs else _range(value)
             found.append(Key(f"{name}.{key}", defaults.get(name, {}).get(key), words))
@@ -219,18 +138,6 @@ def _range(kind: dict[str, Any]) -> str:
         return f"from {kind['minimum']:g} to {kind['maximum']:g}"
     side = f"at most {kind['maximum']:g}" if "maximum" in kind else f"below {kind['exclusiveMaximum']:g}"
     return f"above {kind['exclusiveMinimum']:g}, {side}"
-
-
-Kind = TypeVar("Kind")
-
-
-def _made(kind: type[Kind], section: _Section, **others: Any) -> Kind:
-    """Return a dataclass from the section with the same keys; `others` replace values of the file."""
-    # fields() wants a class that mypy knows to be a dataclass, and no bound of a type variable says that
-    names = {field.name for field in fields(kind)} - others.keys()  # type: ignore[arg-type]
-    values = {name: getattr(section, name) for name in names}
-    ladders = {name: Ladder(v.brake, v.land, v.cut) for name, v in values.items() if isinstance(v, _Ladder)}
-    return kind(**{**values, **ladders, **others})
 
 
 @lru_cache(maxsize=1)
@@ -267,33 +174,24 @@ def load_limits(file: Path | str) -> Limits:
     content, places = read_yaml_with_places(file, _SafetyFile, _complete)
     _check_order(content, places)
     airframe = _vehicle(content.vehicle, Path(file).parent, places)
-    pose = content.pose.model_dump()
-    yaw_agreement, attitude_noise = (
-        math.radians(pose.pop(f"{name}_deg")) for name in ("yaw_agreement", "attitude_noise")
-    )
-    limits = Limits(
-        vehicle=content.vehicle,
+    limits = read_as(
+        Limits,
+        content,
         airframe=airframe,
-        plan=_plan_limits(content.plan, airframe),
-        flight=_made(FlightLimits, content.flight, stop_tilt=math.radians(content.flight.stop_tilt_deg)),
+        plan=read_as(
+            PlanLimits,
+            content.plan,
+            specific_thrust_min=content.plan.specific_thrust,
+            **within_reserve(airframe, content.plan.motor_reserve),
+        ),
         space=_space(content.space),
-        battery=_made(BatteryLimits, content.battery),
-        pose=PoseLimits(**pose, yaw_agreement=yaw_agreement, attitude_noise=attitude_noise),
-        firmware=_made(
+        firmware=read_as(
             FirmwareSettings,
             content.firmware,
             oldest=_version(content.firmware.oldest),
             newest=_version(content.firmware.newest),
         ),
-        ground=_made(GroundManoeuvres, content.ground),
-        link_loss=LinkLossLimits(
-            only_warn=content.link_loss.outside == "warn",
-            motor_lags=content.link_loss.motor_lags,
-            attitude_error=math.radians(content.link_loss.attitude_error_deg),
-            vertical_acceleration_error=content.link_loss.vertical_acceleration_error,
-            velocity_error=content.link_loss.velocity_error,
-        ),
-        lateness=content.lateness,
+        link_loss=read_as(LinkLossLimits, content.link_loss, only_warn=content.link_loss.outside == "warn"),
     )
     _check_obstacles(limits, places)
     _check_vehicle_can(limits, places)
@@ -317,33 +215,21 @@ def _space(section: _Space) -> Space:
         if round_ := each.cylinder:
             foot = section.low[2]
             obstacles.append(Cylinder(round_.x, round_.y, round_.radius, foot, foot + round_.height, each.name))
-    return _made(Space, section, obstacles=tuple(obstacles))
-
-
-def _plan_limits(plan: _Plan, airframe: Airframe) -> PlanLimits:
-    return PlanLimits(
-        speed=plan.speed,
-        acceleration=plan.acceleration,
-        angular_velocity=plan.angular_velocity,
-        tilt=math.radians(plan.tilt_deg),
-        specific_thrust_min=plan.specific_thrust,
-        angular_acceleration=plan.angular_acceleration,
-        **within_reserve(airframe, plan.motor_reserve),
-    )
+    return Space(section.low, section.high, section.margin, tuple(obstacles))
 
 
 def _version(text: str) -> tuple[int, ...]:
     return tuple(map(int, text.split(".")))
 
 
-def _check_order(content: _SafetyFile, places: Places) -> None:
+def _check_order(content: Any, places: Places) -> None:
     """Check the order of values within the file."""
     _check_limits(content, places)
     _check_space(content, places)
     _check_vehicle(content, places)
 
 
-def _check_limits(content: _SafetyFile, places: Places) -> None:
+def _check_limits(content: Any, places: Places) -> None:
     for section, key in (("plan", "tilt_deg"), ("flight", "stop_tilt_deg")):
         if (tilt := getattr(getattr(content, section), key)) < _QUARTER_TURN:
             raise InputError(
@@ -358,7 +244,7 @@ def _check_limits(content: _SafetyFile, places: Places) -> None:
                 where=places.where("plan", key),
                 hint=f"allow at least {least:g}; to fly slower, use --speed",
             )
-    for name in _Flight.ladders():
+    for name in (field.name for field in fields(FlightLimits) if field.type is Ladder):
         ladder = getattr(content.flight, name)
         if not ladder.brake < ladder.land < ladder.cut:
             raise InputError(
@@ -376,7 +262,7 @@ def _check_limits(content: _SafetyFile, places: Places) -> None:
             )
 
 
-def _check_space(content: _SafetyFile, places: Places) -> None:
+def _check_space(content: Any, places: Places) -> None:
     for axis, (low, high) in enumerate(zip(content.space.low, content.space.high, strict=True)):
         if not high - low > 2 * content.space.margin:
             raise InputError(
@@ -396,7 +282,7 @@ def _check_space(content: _SafetyFile, places: Places) -> None:
         )
 
 
-def _check_vehicle(content: _SafetyFile, places: Places) -> None:
+def _check_vehicle(content: Any, places: Places) -> None:
     if not content.battery.under_load < content.battery.at_rest:
         raise InputError(
             "battery.under_load must be below battery.at_rest",

@@ -32,6 +32,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Phase, PhaseEntered, PoseReceived, SetpointSent, Telemetry, Triple
+from cfplan.geometry.min_snap import MAX_COORDINATE
 from cfplan.recording.record import Record
 from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
@@ -361,10 +362,13 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
         raise InputError(
             f"{len(points)} waypoints at once", where="waypoints", hint=f"give at most {MOST_WAYPOINTS}, and extend"
         )
-    if not np.isfinite(points).all():
-        at = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+    far = ~(np.abs(points) <= MAX_COORDINATE).all(axis=1)  # NaN too
+    if far.any():
+        at = int(np.argmax(far))
         raise InputError(
-            f"{points[at].tolist()} is not a position", where=f"waypoint {at + 1}", hint="give finite numbers"
+            f"{points[at].tolist()} is not a position within {MAX_COORDINATE:g} m of the origin",
+            where=f"waypoint {at + 1}",
+            hint="give metres in the frame of the room",
         )
     return tuple((x, y, z) for x, y, z in points.tolist())
 

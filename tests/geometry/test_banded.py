@@ -37,6 +37,16 @@ def test_definite_matrices_are_solved_for_several_right_sides_however_small_they
     np.testing.assert_allclose(banded.solve_definite(scale * matrix, right), expected, rtol=1e-10)
 
 
+def test_rows_and_columns_may_differ_by_many_decades():
+    matrix, bands, right = system(4)
+    scale = np.logspace(0, -12, len(matrix))
+    rows = np.arange(len(matrix))
+    for d in range(4):
+        matrix[:, d] *= scale * scale[np.maximum(rows - d, 0)]
+    expected = solveh_banded(bands, right, lower=True) / scale[:, None]
+    np.testing.assert_allclose(banded.solve_definite(matrix, scale[:, None] * right), expected, rtol=1e-9)
+
+
 def test_a_matrix_that_is_not_definite_is_not_solved():
     matrix, _, right = system(3)
     matrix[7, 0] = -1.0

@@ -89,6 +89,7 @@ def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limi
         ([[0, 0, 9]], RequestRefusedError, "7.200 m too far out"),
         ([["a", 1, 2]], InputError, "not numbers"),
         ([[np.nan, 0, 1]], InputError, "waypoint 1"),
+        ([[1e300, 0, 1]], InputError, "waypoint 1"),
         ([1, 2, 3], InputError, "rows of x, y, z"),
         ([], InputError, "rows of x, y, z"),
         (np.ones((1000, 3)), InputError, "at most 200"),
