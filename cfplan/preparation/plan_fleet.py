@@ -3,7 +3,8 @@
 fleet file → each vehicle's plan → start delays and clock rates → the certificates of every pair and of lost vehicles
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from cfplan.planning.fleet.coordination import Blocked, coordinate
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
 from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
-from cfplan.planning.fleet.separation import Separation, separations
+from cfplan.planning.fleet.separation import CLEAR, Separation, allowed_deviation, separations
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
@@ -28,7 +29,7 @@ from cfplan.safety.space import inside
 from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 
-TRACKING = 0.05  # m that a vehicle may be off its path; `apart` has it for two vehicles, and a tube needs neither
+_TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
 _LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"
 
 
@@ -189,8 +190,11 @@ def coordinate_fleet(
 
 
 def lost_clearance(apart: float) -> float:
-    """Return the distance, m, from a tube to the others: tubes enclose what the lost vehicle deviates by."""
-    return apart - 2.0 * TRACKING
+    """Return the distance, m, from a tube to the columns of the others.
+
+    Where these are off their paths by all that is allowed, 0.15 m or more are left, and vehicles touch at 0.14 m.
+    """
+    return apart - _TUBE_NEARER
 
 
 def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
@@ -215,7 +219,8 @@ def _given_way(plan: Plan) -> Plan:
 def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[str, DryRun]:
     """Encode and rehearse each vehicle's flight, and lose its link at every setpoint; return the dry runs by name.
 
-    Raises NotCertifiedError where bytes, dry run or link loss do not pass. No vehicle is simulated in another's wash.
+    Raises NotCertifiedError where bytes, dry run or link loss do not pass, or a vehicle deviates by more than `apart`
+    allows. No vehicle is simulated in another's wash.
     """
     dry_runs = {}
     for flight in fleet.flights:
@@ -225,11 +230,12 @@ def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[
             results.append(f"{len(encoded.payloads)} setpoints, deviation {dry_runs[flight.name].expected()}")
             lost = find_link_loss(encoded, fleet.limits)
             (results.append if inside(lost.beyond) else results.warn)(str(lost))
+    _require_allowed_deviation(fleet, dry_runs, on_step)
     return dry_runs
 
 
 def prepare_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> tuple[PreparedFlight, ...]:
-    """Do what prepare_flight() does with the plan of each vehicle. Raises NotCertifiedError where one does not pass."""
+    """Do what prepare_flight() does with the plan of each vehicle. Raises NotCertifiedError as rehearse_fleet()."""
     prepared = []
     for flight in fleet.flights:
         with step(on_step, flight.name) as results:
@@ -240,4 +246,23 @@ def prepare_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> tuple[
             results.append(f"{len(encoded.payloads)} setpoints, deviation {rehearsed.expected()}, a stop from each")
             (results.append if inside(lost.beyond) else results.warn)(str(lost))
         prepared.append(PreparedFlight(flight, encoded, rehearsed, lost, stops, mission))
+    _require_allowed_deviation(fleet, {each.planned.name: each.dry_run for each in prepared}, on_step)
     return tuple(prepared)
+
+
+def _require_allowed_deviation(fleet: PlannedFleet, dry_runs: Mapping[str, DryRun], on_step: OnStep) -> None:
+    """Raise NotCertifiedError if a vehicle deviates in its dry run by more than `apart` leaves room for."""
+    allowed = allowed_deviation(fleet.apart)
+    with step(on_step, "deviation") as results:
+        worst = max(dry_runs, key=lambda name: dry_runs[name].deviation)
+        off = dry_runs[worst].deviation
+        results.append(f"{worst} deviates most, by {100 * off:.1f} cm in 95 %, and {100 * allowed:.1f} cm are allowed")
+        if not off <= allowed:
+            nearest = next(each for each in fleet.separations if worst in each.pair)
+            needed = math.ceil(100 * (CLEAR + 2.0 * off)) / 100
+            raise NotCertifiedError(
+                f"{' and '.join(nearest.pair)} are kept {fleet.apart:g} m apart, which allows each to deviate by "
+                f"{100 * allowed:.1f} cm, and {worst} deviates by {100 * off:.1f} cm in 95 % of its dry runs",
+                where=fleet.name,
+                hint=f"write `apart: {needed:.2f}` in the fleet file, or plan with lower limits",
+            )

@@ -10,7 +10,7 @@ Each vehicle has its own pilot, which may end its flight at any time. The conduc
                   the fleet begins
     flying        each on its own clock, which is that of this computer
     braking       all vehicles brake along their paths and land, once one of them leaves its plan, ends early, does not
-                  answer, or is nearer to another than the fleet's certificate allows
+                  answer, is farther off its path or nearer to another than the fleet's certificate allows
 
 It is a pure core: a driver tells it what it hears, and passes on what it says. Its silence is an order too: a pilot
 that has not heard it for `CONDUCTOR_SILENT` brakes.
@@ -27,6 +27,7 @@ import numpy as np
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.conducted import ClearanceAsked, ConductorMessage, PilotMessage, PlanLeft
+from cfplan.flight.setpoints.encoding import LEAD
 from cfplan.flight.telemetry import (
     Estimate,
     Event,
@@ -34,20 +35,23 @@ from cfplan.flight.telemetry import (
     Phase,
     PhaseEntered,
     PoseReceived,
+    SetpointSent,
     Telemetry,
     Triple,
     VehicleStatus,
 )
+from cfplan.planning.fleet.separation import CLEAR, allowed_deviation
 
 STANDS_WITHIN = 0.05  # m beside the column of its start that a vehicle may stand
-TRACKING = 0.05  # m that each vehicle may be off its path; what is certified to keep apart keeps 2 of these less
+OFF_BY_MORE = 0.05  # m beyond the deviation that `apart` allows, from which on all brake
+"""With another vehicle off by what is allowed, 0.15 m are left, and vehicles touch at 0.14 m."""
 STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: error of the poses
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
-_POSES = 32  # of each vehicle that are remembered
+_POSES = 32  # of each vehicle that are remembered, and as many setpoints
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
 _OF_THE_RADIO = (Estimate, VehicleStatus, Event)  # may come from another thread of the pilot, whose tick loop hangs
 _DESCENDING, _DOWN = (Phase.LAND, Phase.DISARM, Phase.CLOSED), (Phase.DISARM, Phase.CLOSED)
@@ -90,6 +94,8 @@ class _Vehicle:
     cleared: dict[Phase, float] = field(default_factory=dict)
     heard: float = -math.inf  # s, when its pilot's tick loop was heard last
     poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
+    setpoints: deque[SetpointSent] = field(default_factory=lambda: deque(maxlen=_POSES))  # of its plan
+    phase: Phase | None = None  # the last that it has entered
     stood: Triple | None = None  # m, when it passed preflight
     descending: bool = False
     down: bool = False  # its motors are off
@@ -106,9 +112,22 @@ class _Vehicle:
 
     def place(self, time: float) -> Triple:
         """Return where it was at a time, s, between two of its poses."""
-        times = [pose.time for pose in self.poses]
-        x, y, z = (float(np.interp(time, times, [pose.position[axis] for pose in self.poses])) for axis in range(3))
-        return x, y, z
+        return _between(self.poses, time)
+
+    @property
+    def deviation(self) -> float:
+        """Return how far, m, it was off its path when it was seen last, seen from above; 0 before its path begins."""
+        if self.phase is not Phase.STREAM or not self.setpoints:
+            return 0.0
+        pose = self.poses[-1]
+        return math.dist(pose.position[:2], _between(self.setpoints, pose.time - LEAD)[:2])
+
+
+def _between(seen: Sequence[PoseReceived | SetpointSent], time: float) -> Triple:
+    """Return the position, m, at a time, s, between two that are known."""
+    times = [each.time for each in seen]
+    x, y, z = (float(np.interp(time, times, [each.position[axis] for each in seen])) for axis in range(3))
+    return x, y, z
 
 
 class Conductor:
@@ -159,9 +178,15 @@ class Conductor:
         match message:
             case PoseReceived():
                 vehicle.poses.append(message)
+                allowed = allowed_deviation(self._apart) + OFF_BY_MORE
+                if not (off := vehicle.deviation) <= allowed:
+                    self._brake(f"{name}: it is {off:.2f} m off its path, at most {allowed:.2f} m")
+            case SetpointSent():
+                vehicle.setpoints.append(message)
             case PhaseEntered(time=began, phase=phase):
                 if phase is Phase.STREAM and (late := began - vehicle.cleared.get(phase, -math.inf)) > START_LATE:
                     self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE:g} s")
+                vehicle.phase = phase
                 vehicle.descending |= phase in _DESCENDING
                 vehicle.down |= phase in _DOWN
             case ClearanceAsked(phase=phase):
@@ -211,9 +236,8 @@ class Conductor:
         moment = min(a.poses[-1].time, b.poses[-1].time)
         distance = math.dist(a.place(moment)[:2], b.place(moment)[:2])
         self.nearest = min(self.nearest, distance)
-        allowed = self._apart - 2.0 * TRACKING
-        if distance < allowed:
-            self._brake(f"{a.name} and {b.name} are {distance:.2f} m apart, which must be {allowed:.2f} m")
+        if distance < CLEAR:
+            self._brake(f"{a.name} and {b.name} are {distance:.2f} m apart, which must be {CLEAR:.2f} m")
 
     # What lets it go on.
 

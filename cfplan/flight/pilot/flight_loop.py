@@ -171,6 +171,11 @@ class FlightLoop:
         self._begun.append(self.stream)
         return self.stream
 
+    @property
+    def conducted(self) -> bool:
+        """Return whether the vehicle flies in a fleet."""
+        return self._conductor is not NO_CONDUCTOR
+
     def begin_plan(self) -> None:
         """Send the plan from the next deadline on."""
         self.plan = self.begin(self.plan)

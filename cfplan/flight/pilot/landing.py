@@ -69,7 +69,7 @@ class Landing:
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, loop.limits.space)
+            sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, self._aside)
             loop.begin(Stream(sinks, stream.rate))
 
     def land(self) -> None:
@@ -112,7 +112,7 @@ class Landing:
         """Sink quickly and away from the walls, until the estimate shows touchdown, time is up, or poses are back."""
         loop = self._loop
         begin = loop.setpoint_now()
-        self._sink(begin, QUICK, self._floor - _BLIND_DEPTH_BELOW_FLOOR, off_walls(begin[0], loop.limits.space))
+        self._sink(begin, QUICK, self._floor - _BLIND_DEPTH_BELOW_FLOOR, self._aside(begin[0]))
         self._was_blind = True
         fresh_since = math.inf
 
@@ -130,6 +130,13 @@ class Landing:
         loop.until(lambda: self._stands_by_estimate() or over() or interrupted(), math.inf)
         if not interrupted():
             self._conclude(self._stands_by_estimate())
+
+    def _aside(self, place: Triple) -> tuple[float, float]:
+        """Return the displacement, m, of a descent without poses: away from walls, but not in a fleet.
+
+        Another vehicle may be there, and the fleet is certified for vehicles that come straight down.
+        """
+        return (0.0, 0.0) if self._loop.conducted else off_walls(place, self._loop.limits.space)
 
     def _sink(
         self,

@@ -9,6 +9,7 @@ touches the floor, where sideways motion would tip it over, so it moves only as 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -136,11 +137,13 @@ def _sideways(aside: tuple[float, float], within: int, count: int, rate: float, 
     )
 
 
-def sinking(payloads: NDArray, lowest: float, speed: float, rate: float, space: Space) -> NDArray:
+def sinking(
+    payloads: NDArray, lowest: float, speed: float, rate: float, aside: Callable[[Triple], tuple[float, float]]
+) -> NDArray:
     """Return the motion of `payloads`, (N, 29) uint8 at `rate`, Hz, that also sinks, at most at `speed`, m/s.
 
-    It sinks no lower than the height `lowest`, m, and not at all if the motion is that low already; and it moves away
-    from the walls near its end. Only position and velocity change, so it is feedback that moves the vehicle.
+    It sinks no lower than the height `lowest`, m, and not at all if the motion is that low already. It also moves by
+    `aside` of its end, x and y in m. Only position and velocity change, so it is feedback that moves the vehicle.
     """
     motion = decode(payloads)
     room = max(float(motion.position[:, 2].min()) - lowest, 0.0)
@@ -150,7 +153,7 @@ def sinking(payloads: NDArray, lowest: float, speed: float, rate: float, space: 
         fall[row, 2] = min(fall[row - 1, 2] + _QUICK_ACCELERATION / rate, allowed)
         depth[row, 2] = min(depth[row - 1, 2] + fall[row, 2] / rate, room)
     x, y, z = motion.position[-1].tolist()
-    aside, rows = off_walls((x, y, z), space), len(payloads)
-    place, along, _ = _sideways(aside, rows - 1, rows, rate, _STOP_ASIDE_ACCELERATION)
+    rows = len(payloads)
+    place, along, _ = _sideways(aside((x, y, z)), rows - 1, rows, rate, _STOP_ASIDE_ACCELERATION)
     depth[:, :2], fall[:, :2] = -place, -along
     return encode(replace(motion, position=motion.position - depth, velocity=motion.velocity - fall))

@@ -2,11 +2,14 @@
 
 Vehicles get the fastest clock one after another, each among those before it. The best order is unknown, so several are
 tried: the longest flight first; then with the vehicle that was stuck, or ended last, moved to the front; then others.
+Each order is sketched first, without planning again. The first one that costs hardly any time is planned at once; if
+that fails, the search goes on, and at its end all sketches are planned, the fastest first.
 A clock that only waits at the start is exact. One that slows later becomes speed caps, under which the path is planned
 again, so that all limits hold; the result is compared with the other flights again.
 """
 
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -26,7 +29,7 @@ from cfplan.planning.repair import under_caps
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.trajectory import Trajectory
 
-ORDERS, TRIALS = 24, 6  # orders that are sketched; of these the fastest are planned
+ORDERS = 60  # that are tried, at most
 SLACKS = (0.02, 0.05, 0.1)  # m added to the distance in the search, tried until the certificate passes
 _BETWEEN_SKEWS = 0.03  # s, largest spacing within the skew in the search
 _LEAST_SPEED = 0.05  # m/s, of caps
@@ -98,19 +101,21 @@ def coordinate(
     found: list[tuple[float, tuple[int, ...]]] = []
     blocked: Blocked | None = None
     longest = max(member.plan.trajectory.duration for member in members)
+    names = [member.name for member in members]
     orders = _Orders([member.plan.trajectory.duration for member in members])
     for order in orders:
         tracks = search.sketch(order)
-        if isinstance(tracks, Blocked):
-            blocked = blocked or tracks
-            orders.prefer(next(n for n in order if members[n].name == tracks.pair[0]))
+        last = None if isinstance(tracks, Blocked) else max(tracks, key=lambda track: track.end)
+        if last is not None and last.end > longest + 2 * TICK:
+            found.append((last.end, order))
+            orders.prefer(last.number)
             continue
-        last = max(tracks, key=lambda track: track.end)
-        found.append((last.end, order))
-        if last.end <= longest + 2 * TICK:
-            break
-        orders.prefer(last.number)
-    for _, order in sorted(found)[:TRIALS]:
+        made = tracks if isinstance(tracks, Blocked) else search.make(order)
+        if not isinstance(made, Blocked):
+            return made
+        blocked = blocked or made
+        orders.prefer(names.index(made.pair[0]))
+    for _, order in sorted(found):
         made = search.make(order)
         if not isinstance(made, Blocked):
             return made
@@ -129,13 +134,11 @@ class _Orders:
     def __iter__(self) -> Iterator[tuple[int, ...]]:
         assert self._next is not None
         count, random = len(self._next), generator(0)
-        for _ in range(4 * ORDERS):
+        while len(self._tried) < min(ORDERS, math.factorial(count)):
             order, self._next = self._next or tuple(random.permutation(count).tolist()), None
             if order not in self._tried:
                 self._tried.append(order)
                 yield order
-            if len(self._tried) == ORDERS:
-                return
 
     def prefer(self, first: int) -> None:
         """Try next the present order with a vehicle moved to the front."""

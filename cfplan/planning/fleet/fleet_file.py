@@ -23,15 +23,17 @@ from cfplan.errors import InputError
 from cfplan.files.yaml_with_places import HINT, Places, read_plain, read_yaml_with_places
 from cfplan.geometry.path_file import PathFile, PathPlace, load_path_file
 from cfplan.planning.fleet.address_file import read_address_file
+from cfplan.planning.fleet.separation import CLEAR, allowed_deviation
 
 FEWEST, MOST = 2, 6  # vehicles
-APART = 0.30  # m: downwash is below 5 % of weight at 0.20 m, and each vehicle may be 0.05 m off its path
+APART = 0.30  # m, which allows each vehicle 0.05 m off its path, see separation.py
 SKEW = 0.03  # s: three ticks of the clock of a pilot
 _LEAST = {  # least value, unit and hint
     "apart": (
         APART,
         "m",
-        "vehicles are up to 0.05 m off their paths and touch at 0.14 m; leave it out for the default",
+        f"{CLEAR:g} m between vehicles, and {allowed_deviation(APART):g} m for each off its path; leave it out for the "
+        "default",
     ),
     "skew": (SKEW, "s", "pilots begin and obey within some ticks of 0.01 s; leave it out for the default"),
 }

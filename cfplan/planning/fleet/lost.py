@@ -6,7 +6,8 @@ apart from each other, by the certificate of separation. Vehicles of one dongle 
 compared with each other too.
 
 While a lost vehicle is in the air, the others keep away from its tube at all heights. Once it lies, they may pass over
-it, but none may stop or end above it.
+it, but none may stop or end above it. A link that comes back after more than BACK lets its vehicle hover and land where
+it is then, so from BACK on the others also keep away from where the tube has been, until all rest.
 
 A vehicle that still waits at its start stays there when all brake. Within the skew of the fleet's start every vehicle
 may still wait, so the first moment also covers the time before, when all hover at their starts.
@@ -31,6 +32,8 @@ NOTICED = (0.0, 0.6)  # s, soonest and latest, from the last setpoint until the 
 """The conductor hears at once of a pilot that ends its flight or dies. A lost link is known to the pilot 0.4 to 0.5 s
 after the last setpoint: answers to pings, ten a second, must be missing for 0.5 s (flight/pilot/health.py). A hanging
 pilot is noticed after 0.5 s. The conductor's tick and its orders take 0.1 s at most."""
+BACK = 0.4  # s from the last setpoint, after which a vehicle whose link comes back hovers and lands where it is
+"""An earlier return is none for its pilot, which flies on: see NOTICED."""
 _SAMPLE = 0.005  # s of a plan, from one compared place to the next
 _BETWEEN = 1e-4  # m, as in separation.py
 _RESTS = 1e3  # s before its start, of a vehicle that waits for long
@@ -39,7 +42,7 @@ _RESTS = 1e3  # s before its start, of a vehicle that waits for long
 class Tube(NamedTuple):
     """The space that a vehicle may be in after its link is lost, for each setpoint of its plan."""
 
-    boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways to be lost
+    boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways, a lost link the last
     rate: float  # Hz, of the R setpoints
     part: float  # s of each part; the last one, in which it lies, lasts
 
@@ -81,6 +84,7 @@ class _Ways(NamedTuple):
     first: NDArray  # (S,) int, samples from the place at the loss
     last: NDArray  # (S,) int
     rest: NDArray  # (2,) int, first and last where it rests
+    back: int  # first part in which the link of the lost vehicle may be back
     waits: int  # samples; from a place before this one it may brake before it begins, and stays at its start
     far: float  # m, the largest distance that matters
 
@@ -168,6 +172,7 @@ def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
         np.floor(first / _SAMPLE).astype(np.int64),
         np.ceil(last / _SAMPLE).astype(np.int64),
         np.array([np.floor(rests[0] / _SAMPLE), np.ceil(rests[1] / _SAMPLE)]).astype(np.int64),
+        int(BACK / tube.part),
         int(np.ceil((skew - soonest) / _SAMPLE)),
         far,
     )
@@ -192,6 +197,8 @@ def _least(boxes: NDArray, rows: NDArray, samples: NDArray, per_sample: float, b
                 first, last = ways.first[part], ways.last[part]
                 if lies:
                     first, last = ways.rest[0], ways.rest[1]
+                elif way == boxes.shape[0] - 1 and part >= ways.back:
+                    last = ways.rest[1]
                 if begin[n] <= ways.waits:
                     first = -begin[n]
                 first = min(max(begin[n] + first, 0), len(samples) - 1)

@@ -12,6 +12,8 @@ positions that are compared here, and rest at such a pair. The order to brake ma
 adds to the skew. A vehicle that has not begun yet stays at its start when all brake, while the others go on along their
 paths. So each start is also compared with the places of the others until STOP after the vehicle there would have begun.
 
+A vehicle is not exactly on its path. `apart` has room for the deviation of both, and leaves CLEAR between them.
+
 A vehicle without poses or without its link leaves its path, which this certificate does not cover.
 """
 
@@ -26,11 +28,17 @@ from cfplan.machine_code import njit
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.safety.space import inside
 
+CLEAR = 0.20  # m between two columns as they fly: downwash is below 5 % of weight, and vehicles touch at 0.14 m
 SAMPLE = 0.001  # s
 STOP = (
     0.6  # s of its plan that a vehicle passes while it brakes: half the duration of a stop (flight/setpoints/stops.py)
 )
 _BETWEEN = 1e-4  # m, error of linear interpolation between setpoints, at most 5 m/s² · (10 ms)² / 8
+
+
+def allowed_deviation(apart: float) -> float:
+    """Return how far, m, each vehicle may be off its path where paths are certified to keep `apart`, m."""
+    return 0.5 * (apart - CLEAR)
 
 
 @dataclass(frozen=True, slots=True)

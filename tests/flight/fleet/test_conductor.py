@@ -16,7 +16,16 @@ from cfplan.flight.fleet.conductor import (
 )
 from cfplan.flight.pilot.conducted import CONDUCTOR_SILENT, ClearanceAsked, ConductorMessage, HeldConductor, PlanLeft
 from cfplan.flight.pilot.outcome import Rung
-from cfplan.flight.telemetry import Estimate, Event, Level, Phase, PhaseEntered, PoseReceived, VehicleStatus
+from cfplan.flight.telemetry import (
+    Estimate,
+    Event,
+    Level,
+    Phase,
+    PhaseEntered,
+    PoseReceived,
+    SetpointSent,
+    VehicleStatus,
+)
 
 APART = 0.3
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -25,11 +34,11 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 class Fleet:
     """Two vehicles 0.5 m from each other, as their conductor hears them."""
 
-    def __init__(self, delay=0.0, right=(0.5, 0.0, 0.0)):
+    def __init__(self, delay=0.0, right=(0.5, 0.0, 0.0), apart=APART):
         self.places = {"left": (0.0, 0.0, 0.0), "right": right}
         starts = {name: (x, y, 0.6) for name, (x, y, _) in self.places.items()}
         delays = {"left": 0.0, "right": delay}
-        self.conductor = Conductor([ConductedFlight(name, starts[name], delays[name]) for name in starts], APART)
+        self.conductor = Conductor([ConductedFlight(name, starts[name], delays[name]) for name in starts], apart)
         self.now = 1000.0
         self.silent = set()
 
@@ -234,13 +243,31 @@ def test_all_brake_as_soon_as_a_pilot_reports_that_its_link_is_lost():
     assert "right: the link was lost" in fleet.go_on(0.01)["left"].brakes
 
 
+@pytest.mark.parametrize("apart", [0.3, 0.4])
 @pytest.mark.parametrize(("distance", "brakes"), [(0.21, False), (0.19, True)])
-def test_all_brake_below_the_distance_that_tracking_leaves_at_any_height(distance, brakes):
-    fleet = Fleet()
+def test_all_brake_below_the_distance_that_allowed_deviations_leave_at_any_height(distance, brakes, apart):
+    fleet = Fleet(apart=apart)
     fleet.fly()
     fleet.places["right"] = (distance, 0.0, 2.0)
     assert bool(braking(fleet.go_on(0.02))) is brakes
     assert fleet.conductor.nearest == pytest.approx(distance)
+
+
+@pytest.mark.parametrize(("apart", "off", "brakes"), [(0.3, 0.09, False), (0.3, 0.11, True), (0.4, 0.11, False)])
+def test_all_brake_when_one_is_farther_off_its_path_than_certified_whatever_its_height(apart, off, brakes):
+    """It flies at 2 m/s along x, and is seen 20 ms late."""
+    fleet, still = Fleet(apart=apart), (0.0, 0.0, 0.0)
+    fleet.fly()
+    fleet.hear("right", PhaseEntered(fleet.now, Phase.STREAM))
+    for tick in range(60):
+        fleet.now += 0.01
+        x = 0.5 + 0.02 * tick
+        fleet.hear("right", SetpointSent(fleet.now, fleet.now, tick, (x, 0.0, 0.6), still, still, LEVEL, still))
+        fleet.hear("right", PoseReceived(fleet.now - 0.02, fleet.now, (x - 0.04, off * (tick > 30), 0.4), LEVEL))
+        fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.0, 0.0, 0.6), LEVEL))
+        said = fleet.conductor.say(fleet.now)
+    assert bool(braking(said)) is brakes
+    assert ("right: it is 0.11 m off its path" in said["left"].brakes) is brakes
 
 
 def test_a_vehicle_seen_later_than_another_is_compared_at_one_moment():

@@ -1,6 +1,5 @@
 """Descents without poses, by what the vehicle decodes: off the walls, at rest sideways before the floor."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +64,10 @@ def test_a_vehicle_stays_where_no_wall_is_near_and_between_near_walls_it_goes_to
     )
 
 
+def inwards(place):
+    return off_walls(place, LIMITS.space)
+
+
 def a_stop(end, duration=0.9):
     motion = hover_to_hover((end[0], end[1] - 0.5, end[2]), 0.3, end, 0.3, duration, RATE)
     return encode_motion(motion, motion.acceleration, space=LIMITS.space)
@@ -72,7 +75,7 @@ def a_stop(end, duration=0.9):
 
 def test_a_stop_that_sinks_near_a_wall_ends_off_it_at_rest():
     stop = a_stop((2.05, 0.0, 1.0))
-    rows, before = decode(sinking(stop, 0.4, QUICK.speed, RATE, LIMITS.space)), decode(stop)
+    rows, before = decode(sinking(stop, 0.4, QUICK.speed, RATE, inwards)), decode(stop)
     aside = rows.position[:, :2] - before.position[:, :2]
     assert aside[-1] == pytest.approx((-0.4, 0.0), abs=2 * QUANTUM)
     assert (np.diff(aside[:, 0]) <= 2 * QUANTUM).all()
@@ -83,8 +86,8 @@ def test_a_stop_that_sinks_near_a_wall_ends_off_it_at_rest():
 
 def test_a_stop_that_sinks_far_from_walls_only_sinks_and_one_row_stays_as_it_is():
     stop = a_stop((0.0, 0.0, 1.0))
-    rows, before = decode(sinking(stop, 0.4, QUICK.speed, RATE, LIMITS.space)), decode(stop)
+    rows, before = decode(sinking(stop, 0.4, QUICK.speed, RATE, inwards)), decode(stop)
     assert np.array_equal(rows.position[:, :2], before.position[:, :2])
     assert rows.position[-1, 2] == pytest.approx(0.4, abs=0.05)
     last = stop[-1:]
-    assert np.array_equal(sinking(last, 0.4, QUICK.speed, RATE, replace(LIMITS.space, margin=0.0)), last)
+    assert np.array_equal(sinking(last, 0.4, QUICK.speed, RATE, inwards), last)

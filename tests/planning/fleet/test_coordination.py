@@ -9,7 +9,8 @@ import pytest
 
 from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.stops import stop_clock, stop_motion
-from cfplan.planning.fleet.coordination import Blocked, coordinate
+from cfplan.planning.fleet import coordination
+from cfplan.planning.fleet.coordination import SLACKS, Blocked, coordinate
 from cfplan.planning.fleet.separation import STOP, separations
 
 APART, SKEW = 0.30, 0.03
@@ -134,3 +135,41 @@ def test_vehicles_that_meet_on_one_line_are_refused_with_pair_place_and_time(mem
     assert low <= blocked.place[0] <= high
     assert blocked.place[1] == pytest.approx(0.0, abs=0.06)
     assert math.isfinite(blocked.time)
+
+
+@pytest.fixture
+def refused(monkeypatch):
+    """Let the certificate refuse the first plans; return the numbers of those refused and of those looked at."""
+
+    def refuse(first):
+        looked = []
+
+        def certify(members, skew):
+            looked.append(members)
+            found = separations(members, skew)
+            return tuple(replace(each, distance=0.0) for each in found) if len(looked) <= first else found
+
+        monkeypatch.setattr(coordination, "separations", certify)
+        return looked
+
+    return refuse
+
+
+@pytest.fixture(scope="module")
+def beside(member):
+    """Three that never come near each other, so that the first order is the best."""
+    low, high = WALLS
+    return tuple(member(f"at {y}", (low, y, 1), (high, y, 1)) for y in (-1, 0, 1))
+
+
+def test_the_search_goes_on_when_the_best_order_cannot_be_certified(beside, refused):
+    refused(len(SLACKS))
+    made = coordinate(beside, APART, SKEW, lambda slower: slower)
+    assert not isinstance(made, Blocked)
+
+
+def test_every_order_of_three_is_tried_before_they_are_refused(beside, refused):
+    looked = refused(math.inf)
+    assert isinstance(coordinate(beside, APART, SKEW, lambda slower: slower), Blocked)
+    first_two = {(first.name, second.name) for second, first in looked}
+    assert len(first_two) == math.factorial(3)

@@ -121,6 +121,17 @@ def test_a_vehicle_that_waits_when_told_to_brake_stays_at_its_start(crossing):
     assert braking[3] > 0.2
 
 
+@pytest.mark.parametrize(("part", "stays"), [(6, False), (12, True)])
+def test_a_link_that_comes_back_leaves_its_vehicle_where_its_tube_was(crossing, part, stays):
+    """The other comes by 0.9 s after the loss, when the tube has left that place for long."""
+    other = crossing[0].plan
+    own = 0.5 * other.trajectory.duration - 0.5
+    boxes = np.full((1, 1, 60, 2, 3), 50.0)
+    boxes[0, 0, part] = other.trajectory.at(own + 0.9).position
+    away = distances(Tube(boxes, RATE, 0.04), np.zeros(1), (other, np.array([own])), STOP, SKEW)
+    assert away[0] < 0.02 if stays else away[0] > 0.2
+
+
 @pytest.mark.slow
 def test_drawn_vehicles_without_link_and_poses_keep_the_distance(coordinated, encoded, limits):
     for lost, other in (coordinated, coordinated[::-1]):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cfplan.planning.fleet.separation import CLEAR
 from cfplan.simulation.lab.downwash import contacts, downwash, share_air
 from cfplan.simulation.lab.lab import MOTORS, ROW_SIZE, STATE, TIME, Truth
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
@@ -23,6 +24,10 @@ MEASURED = {  # by m above: g on a vehicle of 34 g, down, and its standard devia
 def test_the_fit_is_within_the_spread_of_what_was_measured(above):
     for across, (grams, deviation) in zip(ACROSS, MEASURED[above], strict=True):
         assert 34.0 * downwash(across, above) == pytest.approx(grams, abs=1.1 * deviation)
+
+
+def test_vehicles_that_are_clear_of_each_other_lose_no_twentieth_of_their_weight_at_any_height():
+    assert max(downwash(CLEAR, above) for above in np.arange(0.05, 3.0, 0.05)) < 0.05
 
 
 def hovering(height: float, x: float = 0.0) -> VirtualCrazyflie:

@@ -15,11 +15,15 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Phase, PhaseEntered
+from cfplan.planning.fleet.lost import BACK
+from cfplan.planning.fleet.separation import allowed_deviation
+from cfplan.preparation.plan_fleet import plan_fleet, prepare_fleet
 from cfplan.safety.limits import GroundManoeuvres
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_fleet import SteppedFleet
 from cfplan.simulation.lab.stepped_lab import SteppedLab
+from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_crazyflie.supervisor import State
@@ -28,7 +32,8 @@ from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 pytestmark = pytest.mark.integration
 
 QUICK = GroundManoeuvres(take_off_height=0.5, take_off_speed=0.6, go_to_speed=0.6, land_speed=0.6)
-LIMITS = replace(load_limits(Path(__file__).parents[3] / "safety.yaml"), ground=QUICK)
+REPOSITORY = Path(__file__).parents[3]
+LIMITS = replace(load_limits(REPOSITORY / "safety.yaml"), ground=QUICK)
 APART = 0.3
 DISARMED = (State.CHECKS_NOT_PASSED, State.CHECKS_PASSED, State.RESET, State.LOCKED, State.CRASHED)
 
@@ -44,15 +49,20 @@ def mission(y: float) -> Mission:
 MISSIONS = {"left": mission(0.0), "right": mission(0.45)}
 
 
-OWN = {  # they do not arm themselves, so that the last state says whether they were disarmed
-    name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
-    for name, each in MISSIONS.items()
-}
+def standing(missions):
+    """Each under its start; they do not arm themselves, so that the last state says whether they were disarmed."""
+    return {
+        name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
+        for name, each in missions.items()
+    }
 
 
-def fleet_of(missions=MISSIONS, settings=None, delays=None):
+OWN = standing(MISSIONS)
+
+
+def fleet_of(missions=MISSIONS, delays=None):
     flights = [ConductedFlight(name, each.start[0], (delays or {}).get(name, 0.0)) for name, each in missions.items()]
-    return SteppedFleet(missions, Conductor(flights, APART), settings=settings or OWN)
+    return SteppedFleet(missions, Conductor(flights, APART), settings=standing(missions))
 
 
 def streaming(fleet, name, moment, act):
@@ -134,6 +144,37 @@ def test_a_pilot_that_stalls_before_its_start_lets_all_brake():
     assert max(flight.truths["left"].position[:, 0]) < 0.5
 
 
+def lose_link(fleet, duration):
+    return lambda: fleet.labs["left"].disturb(RadioFault(RadioFaultKind.DEAD, 0.0, duration))
+
+
+def test_all_brake_when_a_short_loss_of_a_link_takes_a_vehicle_off_its_path():
+    """By itself its pilot would fly on: it takes the uplink for gone after 0.5 s only."""
+    fleet = fleet_of()
+    flight = fleet.fly(streaming(fleet, "left", 0.6, lose_link(fleet, 0.3)))
+    assert flight.brakes.startswith("left: it is 0.1")
+    assert_down(flight)
+    assert max(max(truth.position[:, 0]) for truth in flight.truths.values()) < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("lasts", [0.5, 0.7, 0.9])
+@pytest.mark.parametrize("moment", [0.8, 1.1, 1.6])
+def test_a_vehicle_whose_link_comes_back_lands_where_its_tube_has_been(moment, lasts):
+    """From BACK on; that is where the certificate of lost vehicles has it until all rest."""
+    fleet = fleet_of()
+    flight = fleet.fly(streaming(fleet, "left", moment, lose_link(fleet, lasts)))
+    assert_down(flight)
+    payloads, lost = MISSIONS["left"].payloads, begun(flight)["left"] + moment
+    tubes = link_loss_tubes(payloads, LIMITS, round(100 * moment) + np.arange(-2, 3))[-1]
+    boxes = tubes[:, round(1000 * BACK / TUBE_PART) :]
+    low, high = boxes[:, :, 0, :2].min(axis=(0, 1)), boxes[:, :, 1, :2].max(axis=(0, 1))
+    truth = flight.truths["left"]
+    way = truth.position[truth.time > lost + BACK, :2]
+    assert (low <= way).all()
+    assert (way <= high).all()
+
+
 def kill_pilot(fleet):
     fleet.labs["left"].kill_pilot()
 
@@ -167,6 +208,49 @@ def test_with_one_fault_none_touches_another_and_all_come_down(fault, moment):
     assert flight.brakes.startswith("left")
     assert flight.reasons["right"].startswith("the fleet brakes: left")
     assert_down(flight)
+
+
+def lose_all_poses(fleet):
+    for lab in fleet.labs.values():
+        lab.disturb(ViconFault(FaultKind.OCCLUDE))
+
+
+def nearest_after(flight, begin):
+    """The least distance of the two columns, m, from a time on until both are on the floor."""
+    left, right = flight.truths.values()
+    other = np.column_stack([np.interp(left.time, right.time, along) for along in right.position.T])
+    flies = (np.maximum(left.position[:, 2], other[:, 2]) > 0.05) & (left.time >= begin)
+    return float(np.linalg.norm((other - left.position)[flies, :2], axis=1).min())
+
+
+def test_vehicles_beside_a_wall_keep_apart_when_all_poses_are_lost():
+    """One alone would move 0.4 m off the wall at y = 4, to where the other is."""
+    missions = {"left": mission(2.95), "right": mission(3.35)}
+    fleet = fleet_of(missions)
+    flight = fleet.fly(streaming(fleet, "left", 0.8, lambda: lose_all_poses(fleet)))
+    assert_down(flight)
+    assert nearest_after(flight, begun(flight)["left"]) > APART
+
+
+@pytest.fixture(scope="module")
+def two():
+    """The example fleet of two, certified, and its missions."""
+    planned = plan_fleet(REPOSITORY / "flights" / "fleets" / "two.yaml", load_limits(REPOSITORY / "safety.yaml"))
+    return planned, {each.planned.name: each.mission for each in prepare_fleet(planned)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moment", [0.5, 2.5, 4.5, 5.5, 6.0, 7.0])
+def test_two_vehicles_whose_poses_all_stop_come_no_nearer_than_certified(two, moment):
+    planned, missions = two
+    flights = [ConductedFlight(each.name, missions[each.name].start[0], each.delay) for each in planned.members]
+    fleet = SteppedFleet(missions, Conductor(flights, planned.apart), settings=standing(missions))
+    first = min(planned.members, key=lambda each: each.delay).name
+    flight = fleet.fly(streaming(fleet, first, moment, lambda: lose_all_poses(fleet)))
+    assert_down(flight)
+    assert "pose" in flight.brakes
+    allowed = 2.0 * allowed_deviation(planned.apart)
+    assert nearest_after(flight, begun(flight)[first] + moment) > planned.separations[0].distance - allowed
 
 
 @pytest.mark.slow

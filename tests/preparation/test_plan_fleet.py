@@ -1,0 +1,54 @@
+"""Fleets are rehearsed: what a vehicle deviates by must fit into the distance that the fleet keeps."""
+
+import re
+from dataclasses import replace
+
+import pytest
+
+from cfplan.errors import NotCertifiedError
+from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.fleet.members import FleetMember
+from cfplan.planning.fleet.separation import CLEAR, separations
+from cfplan.planning.plan import plan
+from cfplan.preparation.plan_fleet import PlannedFleet, prepare_fleet, rehearse_fleet
+from cfplan.preparation.plan_flight import PlannedFlight
+from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.simulation.dry_run import dry_run
+
+SKEW = 0.03
+
+
+@pytest.fixture(scope="module")
+def line(limits):
+    return plan(min_snap([[-0.6, 0.0, 1.0], [0.6, 0.0, 1.0]]), limits.airframe, limits)
+
+
+@pytest.fixture(scope="module")
+def deviation(line, limits):
+    """The 95 % deviation of the line, m."""
+    return dry_run(encode_flight(PlannedFlight("line", line, limits)), line.trajectory, limits).deviation
+
+
+@pytest.fixture
+def fleet(line, limits):
+    """Two vehicles, one after another on one line, that are certified to keep a distance apart."""
+
+    def make(apart):
+        members = (FleetMember("first", line), FleetMember("next", line, 2.0 * line.trajectory.duration))
+        return PlannedFleet("row", apart, SKEW, members, separations(members, SKEW), (), members[0].end, limits)
+
+    return make
+
+
+@pytest.mark.parametrize("rehearsed", [rehearse_fleet, prepare_fleet])
+def test_a_fleet_whose_vehicles_deviate_more_than_allowed_is_refused_with_the_distance_needed(
+    fleet, deviation, rehearsed
+):
+    narrow = fleet(CLEAR + 2.0 * deviation - 0.002)
+    with pytest.raises(NotCertifiedError) as refused:
+        rehearsed(narrow)
+    for text in ("first and next", f"{100 * deviation:.1f} cm", f"{100 * deviation - 0.1:.1f} cm"):
+        assert text in refused.value.what
+    needed = float(re.search(r"apart: ([\d.]+)", refused.value.hint)[1])
+    assert needed - 0.01 < CLEAR + 2.0 * deviation <= needed
+    assert rehearsed(replace(narrow, apart=needed))
