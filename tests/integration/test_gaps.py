@@ -12,12 +12,16 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import encode_stops
+from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
-from cfplan.simulation.glitches import GAP, glitch_at_every_setpoint
+from cfplan.simulation.draws import draw_vehicles
+from cfplan.simulation.glitches import GAP, glitch_at_every_setpoint, glitch_at_sampled_setpoints
+from cfplan.simulation.lab.stepped_lab import SteppedLab
 from studies.fault_scenarios import Scenario
 from studies.faults import fly_stepped
 
-LOOP = Path(__file__).parents[1] / "data" / "loop_that_a_gap_loses.npz"
+REPOSITORY = Path(__file__).parents[2]
+LOOP = REPOSITORY / "tests" / "data" / "loop_that_a_gap_loses.npz"
 """Setpoints of an earlier plan of flights/loop3d.yaml: after some gaps the vehicle strays for 1.5 s, and is lost."""
 pytestmark = pytest.mark.integration
 
@@ -25,7 +29,7 @@ pytestmark = pytest.mark.integration
 @pytest.fixture(scope="module")
 def loop():
     """The loop, for the vehicle without a moment by velocity, for which it was planned."""
-    limits = load_limits(Path(__file__).parents[2] / "safety.yaml")
+    limits = load_limits(REPOSITORY / "safety.yaml")
     plain = replace(limits.airframe, velocity_moment=(0.0, 0.0), thrust_scale=1.0, lift_with_speed=0.0)
     limits = replace(limits, airframe=plain)
     payloads = np.load(LOOP)["payloads"]
@@ -42,3 +46,17 @@ def test_gaps_that_lose_the_vehicle_in_the_lab_lose_it_in_the_simulation(loop):
         assert flown.outcome is not None
         assert flown.outcome.rung is rung, (moment, flown.reason)
         assert found.lost[0, round(moment * RATE)] == (rung is Rung.CUT), moment
+
+
+def test_the_plan_of_that_loop_as_it_is_now_loses_no_drawn_vehicle_at_its_worst_moments():
+    limits = load_limits(REPOSITORY / "safety.yaml")
+    mission = prepare_mission(REPOSITORY / "flights" / "loop3d.yaml", limits)
+    usage = glitch_at_sampled_setpoints(mission.payloads, limits).usage(limits)[0]
+    worst = int(np.argmax(usage))
+    vehicles = [limits.airframe, *(draw.airframe for draw in draw_vehicles(limits.airframe, limits.pose, 4))]
+    for number in (worst - 8, worst, worst + 8):
+        scenario = Scenario("gap", Rung.NONE, moment=number / RATE, stall=GAP - 1 / RATE)
+        for seed, airframe in enumerate(vehicles):
+            flown = fly_stepped(scenario, mission, lab=SteppedLab(airframe, vehicle=scenario.vehicle, seed=seed))
+            assert flown.outcome is not None
+            assert flown.outcome.rung is Rung.NONE, (number, airframe, flown.reason)

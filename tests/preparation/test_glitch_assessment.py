@@ -21,6 +21,13 @@ def encoded_under(limits, trajectory):
 
 
 @pytest.fixture(scope="module")
+def limits(limits):
+    """Limits of a vehicle whose motors and thrust are known exactly, so that it flies alone."""
+    known = replace(limits.airframe.spread, thrust_scale=0.0, motor_time_constant=0.0)
+    return replace(limits, airframe=replace(limits.airframe, spread=known))
+
+
+@pytest.fixture(scope="module")
 def loop(limits, tmp_path_factory):
     """A plan along a path of least snap, on which gaps lead farther off than on the fastest one."""
     return plan_flight(along_least_snap("loop3d", tmp_path_factory.mktemp("loop")), limits).plan

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
@@ -31,7 +32,13 @@ LATE = Conditions(estimate=EstimateErrors(latency=LATENCY))
 
 @pytest.fixture(scope="module")
 def limits():
-    return load_limits(REPOSITORY / "safety.yaml")
+    """Limits of a vehicle whose motors and thrust are known exactly, so that it flies alone."""
+    return with_spread(load_limits(REPOSITORY / "safety.yaml"), thrust_scale=0.0, motor_time_constant=0.0)
+
+
+def with_spread(limits, **spread):
+    airframe = limits.airframe
+    return replace(limits, airframe=replace(airframe, spread=replace(airframe.spread, **spread)))
 
 
 @pytest.fixture(scope="module")
@@ -141,6 +148,29 @@ def test_gaps_near_critical_setpoints_are_the_same_where_the_vehicle_is_nearly_l
         strict, flight=replace(strict.flight, deviation=replace(strict.flight.deviation, cut=0.9 * cut / 1.1))
     )
     assert glitch_near_critical_setpoints(line, lost).lost.any()
+
+
+@pytest.mark.parametrize("unknown", ["motor_time_constant", "thrust_scale"])
+def test_where_the_vehicle_strays_a_slower_and_a_stronger_one_count_too(found, line, limits, unknown):
+    worst = glitch_at_every_setpoint(line, with_spread(limits, **{unknown: 0.3}))
+    strays = found.usage(limits).max(axis=0) >= 0.4
+    assert 0 < np.count_nonzero(strays) < len(line)
+    np.testing.assert_array_equal(worst.deviation[:, ~strays], found.deviation[:, ~strays])
+    assert np.all(worst.deviation >= found.deviation)
+    other = replace(limits.airframe, **{unknown: 1.3 * getattr(limits.airframe, unknown)})
+    rows = np.arange(len(line))
+    for number in rows[strays & (rows % WITHOUT_POSES_EVERY == 0)]:
+        held = np.where((rows > number) & (rows < number + round(100 * GAP)), number, rows)
+        end = number / 100 + GAP + AFTERWARDS
+        flown = fly_setpoints(
+            decode(line[held]), rows / 100, other, hovering(other, decode(line).position[0]), end,
+            replace(LATE, gains=gains_for(limits.airframe)),
+        )  # fmt: skip
+        since = np.arange(10 * number, round(1000 * end))
+        off = np.linalg.norm(
+            flown.position[since] - decode(line).position[np.minimum(since // 10, len(line) - 1)], axis=1
+        ).max()
+        assert worst.deviation[0, number] > off - 0.005 - 0.03 * off
 
 
 def test_a_vehicle_that_turns_over_is_lost(line, limits):
