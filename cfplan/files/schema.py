@@ -31,12 +31,13 @@ def schema_of(kind: type, **others: Any) -> type[Keys]:
     besides them, and requires; None leaves a field out.
     """
     hints = get_type_hints(kind, include_extras=True)
-    keys: dict[str, Any] = {name: (hint, ...) for name, hint in others.items() if hint is not None}
+    keys: dict[str, Any] = {}
     for field in fields(kind):
         hint, default = hints[field.name], field.default
         if field.name in others:
-            continue
-        if isinstance(hint, type) and is_dataclass(hint):
+            if other := others.pop(field.name):
+                keys[field.name] = (other, ...)
+        elif isinstance(hint, type) and is_dataclass(hint):
             section = schema_of(hint)
             keys[field.name] = (section, ... if default is MISSING else section())
         elif angle := _in_degrees(hint):
@@ -44,11 +45,12 @@ def schema_of(kind: type, **others: Any) -> type[Keys]:
             keys[f"{field.name}_deg"] = (degrees, ... if default is MISSING else math.degrees(default))
         else:
             keys[field.name] = (hint, ... if default is MISSING else default)
+    keys |= {name: (hint, ...) for name, hint in others.items()}
     return create_model(f"_{kind.__name__}", __base__=Keys, **keys)
 
 
 def read_as(kind: type[Kind], section: Keys, **others: Any) -> Kind:
-    """Return the dataclass of a section by `schema_of`; `others` are the values of fields that the file has not."""
+    """Return the dataclass of a section by `schema_of`; `others` are the values of fields that are not in the file."""
     hints = get_type_hints(kind, include_extras=True)
     values: dict[str, Any] = {}
     for name in hints.keys() - others.keys():

@@ -112,8 +112,10 @@ def slow_locally(plan: Plan, assess: Assess, deadline: Deadline = NEVER) -> tupl
 def _faster(
     plan: Plan, assess: Assess, passed: tuple[Plan, Sequence[Assessment]], caps: SpeedCaps, deadline: Deadline
 ) -> tuple[Plan, Sequence[Assessment]]:
-    """Return a faster plan that passes too: at every place the cap is sought by halving, between one that passes and
-    one that is too high near a setpoint that fails.
+    """Return a faster plan that passes too.
+
+    At every place the cap is sought by halving, between one that passes and one that is too high near a setpoint that
+    fails.
     """
     places = np.array(caps.s)
     highest = np.maximum(np.minimum(_speed_at(plan.trajectory, places), plan.limits.plan.speed), caps.speed)
@@ -128,7 +130,8 @@ def _faster(
         assessed = assess(faster.trajectory)
         if not _passed(assessed):
             for each in assessed:
-                for first, last in zip(*_about(faster.trajectory, each, places, (LEADING_UP,) * 2), strict=True):
+                ahead, after = (max(LEADING_UP, about) for about in each.about)
+                for first, last in zip(*_about(faster.trajectory, each, places, (ahead, after)), strict=True):
                     highest[first : last + 1] = between[first : last + 1]
         elif faster.trajectory.duration < slowed.trajectory.duration:
             passed, caps = (faster, assessed), trial

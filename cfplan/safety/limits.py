@@ -91,7 +91,7 @@ class PoseLimits:
     agreement: _UpToOne  # m, largest distance between pose and the vehicle's own estimate
     yaw_agreement: Annotated[float, InDegrees(Gt(0.0), Le(90.0))]  # rad
     position_noise: Annotated[float, Gt(0.0), Le(0.1)] = 0.001  # m, standard deviation along each axis
-    attitude_noise: Annotated[float, InDegrees(Gt(0.0), Le(10.0))] = math.radians(0.2)  # the same about each axis
+    attitude_noise: Annotated[float, InDegrees(Gt(0.0), Le(10.0))] = math.radians(0.2)  # rad, about each axis
 
 
 @dataclass(frozen=True, slots=True)

@@ -106,13 +106,14 @@ def all_keys() -> tuple[Key, ...]:
     """Return every key that safety.yaml may have, in the order of the file; a ladder with its three rungs is one."""
     schema = _SafetyFile.model_json_schema()
     definitions, defaults, found = schema["$defs"], _defaults(), []
-    for name, written in read_plain(DEFAULTS).items():
+    in_file = read_plain(DEFAULTS)
+    for name in sorted(schema["properties"], key=list(in_file).index):
         kind = schema["properties"][name]
         section = definitions.get(kind.get("$ref", "").split("/")[-1])
         if section is None:
             found.append(Key(name, defaults.get(name), _range(kind)))
             continue
-        for key in written:
+        for key in sorted(section["properties"], key=list(in_file[name]).index):
             value = section["properties"][key]
             rungs = definitions.get(value.get("$ref", "").split("/")[-1], {}).get("properties")
             words = f"each {_range(rungs['brake'])}" if rungs else _range(value)

@@ -21,7 +21,7 @@ def narrow_fleet(tmp_path):
     file = tmp_path / "fleet.yaml"
 
     def write(*lines: str):
-        file.write_text("\n".join((*lines, LINES.replace("yaw_deg: 90", "y: 0.35"))))
+        file.write_text("\n".join(("apart: 0.3", *lines, LINES.replace("yaw_deg: 90", "y: 0.35"))))
         return file
 
     return write
@@ -31,7 +31,7 @@ def test_a_fleet_is_planned_and_its_pairs_are_certified(cfplan, fleet_file, safe
     document = cfplan("plan", fleet_file, "--safety", safety_file(), "--json").json
     (pair,) = document["pairs"]
     assert pair["pair"] == ["a", "b"]
-    assert pair["distance"] >= document["apart"] == 0.3
+    assert pair["distance"] >= document["apart"] == 0.35
     assert document["duration"] >= document["slowest_alone"]
     assert any(each["starts"] > 0.0 or each["slower_for"] for each in document["vehicles"])
     assert all(each["certificate"]["passed"] for each in document["vehicles"])

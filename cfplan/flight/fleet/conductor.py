@@ -43,7 +43,7 @@ from cfplan.flight.telemetry import (
 from cfplan.planning.fleet.separation import CLEAR, allowed_deviation
 
 STANDS_WITHIN = 0.05  # m beside the column of its start that a vehicle may stand
-OFF_BY_MORE = 0.05  # m beyond the deviation that `apart` allows, from which on all brake
+OFF_BY_MORE = 0.05  # m beyond the deviation that `apart` allows: all brake if a vehicle is farther off
 """With another vehicle off by what is allowed, 0.15 m are left, and vehicles touch at 0.14 m."""
 STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: error of the poses
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
@@ -116,11 +116,15 @@ class _Vehicle:
 
     @property
     def deviation(self) -> float:
-        """Return how far, m, it was off its path when it was seen last, seen from above; 0 before its path begins."""
-        if self.phase is not Phase.STREAM or not self.setpoints:
+        """Return how far, m, it was beside its place when it was seen last; 0 on its way up and down.
+
+        Its place is its start until its plan begins, then on its path, and at last where it hovers at the end.
+        """
+        if self.descending or Phase.STREAM not in self.asked:
             return 0.0
         pose = self.poses[-1]
-        return math.dist(pose.position[:2], _between(self.setpoints, pose.time - LEAD)[:2])
+        place = _between(self.setpoints, pose.time - LEAD) if self.setpoints else self.flight.start
+        return math.dist(pose.position[:2], place[:2])
 
 
 def _between(seen: Sequence[PoseReceived | SetpointSent], time: float) -> Triple:
@@ -180,7 +184,7 @@ class Conductor:
                 vehicle.poses.append(message)
                 allowed = allowed_deviation(self._apart) + OFF_BY_MORE
                 if not (off := vehicle.deviation) <= allowed:
-                    self._brake(f"{name}: it is {off:.2f} m off its path, at most {allowed:.2f} m")
+                    self._brake(f"{name}: it is {off:.2f} m beside its place, at most {allowed:.2f} m")
             case SetpointSent():
                 vehicle.setpoints.append(message)
             case PhaseEntered(time=began, phase=phase):

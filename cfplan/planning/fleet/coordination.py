@@ -30,6 +30,7 @@ from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
 from cfplan.vehicle.trajectory import Trajectory
 
 ORDERS = 60  # that are tried, at most
+MADE = 12  # of these, whose plans are slowed and compared; the soonest first
 SLACKS = (0.02, 0.05, 0.1)  # m added to the distance in the search, tried until the certificate passes
 _BETWEEN_SKEWS = 0.03  # s, largest spacing within the skew in the search
 _LEAST_SPEED = 0.05  # m/s, of caps
@@ -115,7 +116,7 @@ def coordinate(
             return made
         blocked = blocked or made
         orders.prefer(names.index(made.pair[0]))
-    for _, order in sorted(found):
+    for _, order in sorted(found)[:MADE]:
         made = search.make(order)
         if not isinstance(made, Blocked):
             return made

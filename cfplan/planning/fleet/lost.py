@@ -33,7 +33,7 @@ NOTICED = (0.0, 0.6)  # s, soonest and latest, from the last setpoint until the 
 after the last setpoint: answers to pings, ten a second, must be missing for 0.5 s (flight/pilot/health.py). A hanging
 pilot is noticed after 0.5 s. The conductor's tick and its orders take 0.1 s at most."""
 BACK = 0.4  # s from the last setpoint, after which a vehicle whose link comes back hovers and lands where it is
-"""An earlier return is none for its pilot, which flies on: see NOTICED."""
+"""The pilot does not notice a link that is back sooner, and flies on: see NOTICED."""
 _SAMPLE = 0.005  # s of a plan, from one compared place to the next
 _BETWEEN = 1e-4  # m, as in separation.py
 _RESTS = 1e3  # s before its start, of a vehicle that waits for long

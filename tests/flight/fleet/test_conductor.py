@@ -79,6 +79,10 @@ def cleared(said, phase):
     return {name for name, message in said.items() if phase in message.cleared}
 
 
+def setpoint(time, position):
+    return SetpointSent(time, time, 0, position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
+
+
 def braking(said):
     return {name for name, message in said.items() if message.brakes}
 
@@ -249,6 +253,7 @@ def test_all_brake_below_the_distance_that_allowed_deviations_leave_at_any_heigh
     fleet = Fleet(apart=apart)
     fleet.fly()
     fleet.places["right"] = (distance, 0.0, 2.0)
+    fleet.hear("right", setpoint(fleet.now, (distance, 0.0, 2.0)))
     assert bool(braking(fleet.go_on(0.02))) is brakes
     assert fleet.conductor.nearest == pytest.approx(distance)
 
@@ -256,18 +261,32 @@ def test_all_brake_below_the_distance_that_allowed_deviations_leave_at_any_heigh
 @pytest.mark.parametrize(("apart", "off", "brakes"), [(0.3, 0.09, False), (0.3, 0.11, True), (0.4, 0.11, False)])
 def test_all_brake_when_one_is_farther_off_its_path_than_certified_whatever_its_height(apart, off, brakes):
     """It flies at 2 m/s along x, and is seen 20 ms late."""
-    fleet, still = Fleet(apart=apart), (0.0, 0.0, 0.0)
+    fleet = Fleet(apart=apart)
     fleet.fly()
     fleet.hear("right", PhaseEntered(fleet.now, Phase.STREAM))
     for tick in range(60):
         fleet.now += 0.01
         x = 0.5 + 0.02 * tick
-        fleet.hear("right", SetpointSent(fleet.now, fleet.now, tick, (x, 0.0, 0.6), still, still, LEVEL, still))
+        fleet.hear("right", setpoint(fleet.now, (x, 0.0, 0.6)))
         fleet.hear("right", PoseReceived(fleet.now - 0.02, fleet.now, (x - 0.04, off * (tick > 30), 0.4), LEVEL))
         fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.0, 0.0, 0.6), LEVEL))
         said = fleet.conductor.say(fleet.now)
     assert bool(braking(said)) is brakes
-    assert ("right: it is 0.11 m off its path" in said["left"].brakes) is brakes
+    assert ("right: it is 0.11 m beside its place" in said["left"].brakes) is brakes
+
+
+@pytest.mark.parametrize(("off", "brakes"), [(0.09, False), (0.11, True)])
+@pytest.mark.parametrize("flown", [False, True], ids=["before its path", "after its path"])
+def test_all_brake_when_one_that_hovers_moves_off_its_place(flown, off, brakes):
+    fleet = Fleet(apart=0.3)
+    fleet.fly()
+    if flown:
+        fleet.hear("right", PhaseEntered(fleet.now, Phase.STREAM))
+        fleet.hear("right", setpoint(fleet.now, (1.5, 0.0, 0.6)))
+        fleet.hear("right", PhaseEntered(fleet.now, Phase.HOLD))
+    x = 1.5 if flown else 0.5
+    fleet.places["right"] = (x, off, 0.6)
+    assert bool(braking(fleet.go_on(0.02))) is brakes
 
 
 def test_a_vehicle_seen_later_than_another_is_compared_at_one_moment():
@@ -275,6 +294,8 @@ def test_a_vehicle_seen_later_than_another_is_compared_at_one_moment():
     fleet.fly()
     for step in range(1, 40):  # both move at 2 m/s; the right one is seen 0.1 s late, 0.2 m nearer than it is
         fleet.now += 0.01
+        for name, begins in (("left", 0.0), ("right", 0.5)):
+            fleet.hear(name, setpoint(fleet.now, (begins + 0.02 * step, 0.0, 0.6)))
         fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.02 * step, 0.0, 0.6), LEVEL))
         if step > 10:
             seen = 0.5 + 0.02 * (step - 10)

@@ -32,7 +32,7 @@ def fleet_file(tmp_path):
 def test_each_path_is_turned_and_moved_to_its_place(fleet_file):
     fleet = load_fleet_file(fleet_file(TWO))
     a, b = fleet.vehicles
-    assert (fleet.name, fleet.apart, fleet.skew) == ("fleet", 0.30, 0.03)
+    assert (fleet.name, fleet.apart, fleet.skew) == ("fleet", 0.35, 0.03)
     assert (a.name, a.uri, a.body) == ("a", "sim://0", "one")
     assert a.path_file.waypoints[0] == pytest.approx([-1, 0, 1])
     assert b.path_file.waypoints[0] == pytest.approx([0, 0, 1])
