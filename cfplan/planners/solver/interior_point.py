@@ -36,7 +36,7 @@ from cfplan.planners.solver.barrier import (
 BOUNDARY = 0.99  # of the way to a bound that a step may go, at least
 BARRIER_FACTOR, BARRIER_POWER = 0.2, 1.5  # how fast the barrier parameter falls
 BARRIER_SOLVED = 10.0  # times the barrier parameter: the error at which it falls
-FILTER = 1e-5  # share of the infeasibility by which a step must reduce it, or the cost
+FILTER = 1e-5  # fraction of the infeasibility by which a step must reduce it, or the cost
 SWITCH_COST, SWITCH_FEASIBILITY = 2.3, 1.1
 ARMIJO = 1e-4
 HALVINGS = 14
@@ -78,7 +78,7 @@ class NonlinearProgram(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
-    """How to search; the numbers are in the problem's own units."""
+    """Parameters of a search; the numbers are in the problem's own units."""
 
     barrier: float = 1.0  # at first
     last_barrier: float = 3e-3
@@ -88,18 +88,18 @@ class Search:
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
     multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
     iterations: int = 100
-    least_step: float = 0.0  # share of a Newton step; one that must be shorter is the last: there may be no solution
+    least_step: float = 0.0  # fraction of a Newton step; one that must be shorter is the last: there may be no solution
 
 
 class Multipliers(NamedTuple):
-    """What a search knows of the constraints where it ends, for another to go on from there."""
+    """Slacks and multipliers at the end of a search, from which another can continue."""
 
     bounds: NDArray  # (5, m) of that search
     slacks: NDArray  # (3, m) with their multipliers
 
 
 class SearchResult(NamedTuple):
-    """Where a search ended."""
+    """The result of a search."""
 
     v: NDArray
     values: Values  # there
@@ -111,7 +111,7 @@ class SearchResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Filter:
-    """Which pairs of infeasibility and merit no step may fall behind."""
+    """The filter: pairs of infeasibility and merit that a step must improve on."""
 
     most: float  # infeasibility
     pairs: list[tuple[float, float]] = field(default_factory=list)
@@ -136,7 +136,7 @@ class _Filter:
 
 
 class _Here(NamedTuple):
-    """Where a line search begins, and its direction."""
+    """The start and direction of a line search."""
 
     v: NDArray
     dv: NDArray
