@@ -34,7 +34,7 @@ WARM_UP = 200  # steps over which the learning rate rises at first
 CLIP = 1.0  # largest norm of the gradient
 YAW = 0.01  # weight of the squared error of cos ψ relative to that of log h, both normalised
 NOISE_EPOCHS = 5  # epochs between new perturbations
-UNSEEN_SHARE = 0.05  # fraction of the paths on which each epoch is validated
+UNSEEN_FRACTION = 0.05  # fraction of the paths on which each epoch is validated
 FEATURES = "paper 1"  # version of the networks' inputs, and of what they are validated by
 
 
@@ -218,7 +218,7 @@ def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
 def _split(sequences: Sequences, seed: int) -> tuple[Sequences, Sequences]:
     """Return the validation set and the training set."""
     order = np.random.default_rng([seed, 0]).permutation(len(sequences.rows))
-    count = max(1, round(UNSEEN_SHARE * len(order)))
+    count = max(1, round(UNSEEN_FRACTION * len(order)))
     return sequences.part(np.sort(order[:count])), sequences.part(np.sort(order[count:]))
 
 
