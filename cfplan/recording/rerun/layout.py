@@ -36,7 +36,7 @@ SUMMARY = "summary"
 
 TAIL_SECONDS = 2.0
 LONG_IN_Y, LONG_IN_X = (0.76, -0.20, 0.52), (-0.20, -0.76, 0.52)
-"""From where a room is looked at, from its centre and in lengths of its diagonal, so that all of it is in sight."""
+"""Camera positions from the room's centre, in lengths of its diagonal, from which all of the room is in sight."""
 PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
