@@ -45,7 +45,7 @@ def answer_platform(channel: int, payload: bytes, *, protocol: int, firmware: st
 
 
 class Memories:
-    """The list of memories; of these only the one for trajectories holds anything."""
+    """The list of memories; only the one for trajectories has any content."""
 
     def __init__(self) -> None:
         self.trajectory = bytearray(TRAJECTORY_MEMORY_SIZE)

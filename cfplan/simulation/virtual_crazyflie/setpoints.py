@@ -29,7 +29,7 @@ QUATERNION, BODY_RATE = slice(9, 13), slice(13, 16)
 ROLL, PITCH, YAW, THRUST = range(16, 20)
 ROLL_RATE, PITCH_RATE, YAW_RATE = range(13, 16)
 
-_LEAST_THRUST, _MOST_THRUST = 1000, 60000
+_MIN_THRUST, _MAX_THRUST = 1000, 60000
 
 _VELOCITY_LEGACY, _HEIGHT_LEGACY, _ALTITUDE_HOLD, _HOVER_LEGACY = 1, 2, 4, 5
 _STOP, _POSITION, _VELOCITY, _HEIGHT, _HOVER, _MANUAL = 0, 7, 8, 9, 10, 11
@@ -147,6 +147,6 @@ class AttitudeSetpoints:
         setpoint = Setpoint()
         _tilt(setpoint, roll, pitch)
         _turn_at(setpoint, -turn)
-        setpoint.values[THRUST] = 0 if self._locked or thrust < _LEAST_THRUST else min(thrust, _MOST_THRUST)
+        setpoint.values[THRUST] = 0 if self._locked or thrust < _MIN_THRUST else min(thrust, _MAX_THRUST)
         setpoint.mode[MODE_Z] = DISABLE
         return setpoint

@@ -27,9 +27,9 @@ _CONTROLLER_SIZE = SETPOINT + SETPOINT_SIZE
 
 
 class Loop(NamedTuple):
-    """Everything that the compiled loop reads and changes, in place: views of one array of numbers, but for whole ones.
+    """The state of the compiled loop, changed in place: views of one array of floats, and the integers.
 
-    To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
+    Unpacking the arguments of a call array by array would cost more than the arithmetic of a millisecond.
     """
 
     controller: NDArray  # (51,) as in `engine.layout`, of which it uses the Mellinger controller and the setpoint

@@ -1,6 +1,6 @@
 """The virtual Crazyflie: body, sensors, battery and the radio's processor of a vehicle, around its firmware.
 
-Nothing but the sensors and the recorder sees the true state; the firmware flies on what it measures and is sent.
+Only the sensors and the recorder see the true state; the firmware flies by measurements and packets.
 """
 
 import os
@@ -81,7 +81,7 @@ class VirtualCrazyflie:
         return self._locked
 
     def inject(self, fault: VehicleFault) -> None:
-        """Let something go wrong; its start counts from now.
+        """Add a fault; its start counts from now.
 
         Raises InputError for a fault of the firmware, if this one does not simulate any.
         """
