@@ -40,7 +40,7 @@ AROUND = 0.35  # m between the box of the waypoints and the walls of a tight roo
 HALL_KIND = list(KINDS)[1]
 _BESIDE = 0.2  # m between the waypoints in a hall and its walls
 _AROUND_TRACKS = 2.0  # m between the waypoints of a track and its walls
-_ROUNDING = 1e-9  # share of a time
+_ROUNDING = 1e-9  # fraction of a time
 _FEW = 10  # waypoints, up to which times are compared
 
 
@@ -74,12 +74,12 @@ class ChosenFlight:
 
     @property
     def over(self) -> float:
-        """Return by which share the flight takes longer than the point mass."""
+        """Return the relative excess of the flight's time over that of the point mass."""
         return self.duration / self.point_mass - 1.0
 
     @property
     def saved(self) -> float:
-        """Return the share of the time along min-snap that is saved."""
+        """Return the fraction of the time along min-snap that is saved."""
         return 1.0 - self.duration / self.min_snap
 
     @property

@@ -1,9 +1,9 @@
 """Train the paper's networks until their validation loss is flat, one folder each; training is resumable.
 
-Transformer and MLPs learn by teacher forcing, on which the paper's explanation of their failures rests. The LSTM, which
-according to the paper is fed its own answers, is fed those that it gives at that moment; gradients do not pass through
-them. Noise injection follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As
-an option that is not in the paper, perturbed paths are solved again.
+Transformer and MLPs learn by teacher forcing, as the paper's explanation of their failures assumes. The LSTM, which is
+fed its own answers according to the paper, is fed its current ones; gradients do not pass through them. Noise injection
+follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As an option that is not
+in the paper, perturbed paths are solved again.
 """
 
 import json
@@ -40,7 +40,7 @@ FEATURES = "paper 1"  # version of the networks' inputs, and of what they are va
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UntilFlat:
-    """When a training ends: once its validation loss is flat at every learning rate.
+    """The stopping rule of a training: its validation loss is flat at every learning rate.
 
     The loss is flat after `patience` epochs in which it stayed above (1 - `improvement`) of the least until then. The
     learning rate is then multiplied by `factor`, `cuts` times; when the loss is flat once more, the training ends. Its
@@ -71,7 +71,7 @@ class UntilFlat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Training:
-    """What is known of a finished training."""
+    """The figures of a finished training."""
 
     epochs: int
     best: int  # epoch with the least validation loss, whose network is kept
@@ -265,7 +265,7 @@ def _run_epoch(
 
 
 def _fed(network: SequenceNetwork, seen: Tensor, answers: Tensor, options: SequenceOptions) -> Tensor:
-    """Return what a network is fed as its previous answers: the true ones, or its own at this moment."""
+    """Return the previous answers that a network is fed: the true ones, or its own at this moment."""
     if options.kind is not Kind.LSTM:
         return answers
     with torch.no_grad():
