@@ -103,8 +103,8 @@ def _rates(signals: FlightSignals) -> CubicSpline:
 
 def _at(grid: NDArray, turned: NDArray, time: NDArray) -> Rotation:
     place = np.clip(((time - grid[0]) / STEP).astype(int), 0, len(grid) - 2)
-    share = ((time - grid[place]) / STEP)[:, None]
-    return Rotation.from_quat(turned[place] * (1 - share) + turned[place + 1] * share)
+    weight = ((time - grid[place]) / STEP)[:, None]
+    return Rotation.from_quat(turned[place] * (1 - weight) + turned[place + 1] * weight)
 
 
 @njit

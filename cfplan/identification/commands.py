@@ -40,10 +40,10 @@ class CollectiveCommand:
         next prediction. Between whole milliseconds it is interpolated, so that it changes smoothly with both.
         """
         total = np.zeros(len(self.grid))
-        for by_delay, share in _neighbours(delay):
+        for by_delay, weight in _neighbours(delay):
             for by_phase, other in _neighbours(phase):
-                if share * other > 0.0:
-                    total += share * other * self._stairs(by_delay, by_phase)
+                if weight * other > 0.0:
+                    total += weight * other * self._stairs(by_delay, by_phase)
         return total
 
     def _stairs(self, delay: float, phase: float) -> NDArray:
@@ -106,5 +106,5 @@ def _neighbours(value: float) -> tuple[tuple[float, float], tuple[float, float]]
     """Return the whole milliseconds on both sides, s, with their weights."""
     steps = value / _STEP
     low = np.floor(steps)
-    share = float(steps - low)
-    return (float(low * _STEP), 1.0 - share), (float((low + 1.0) * _STEP), share)
+    weight = float(steps - low)
+    return (float(low * _STEP), 1.0 - weight), (float((low + 1.0) * _STEP), weight)

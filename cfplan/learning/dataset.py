@@ -87,7 +87,7 @@ def describe(folder: Path) -> dict[str, Any]:
     spec, rows = read_dataset(folder)
     timing = read_timing(folder)
     solved = rows.filter(pa.compute.equal(rows["status"], Status.SOLVED.name))
-    share = _numbers(solved, "certified_share")
+    factor = _numbers(solved, "certified_share")
     values = {name: _numbers(solved, name) for name in ("length", "travel_time", "peak_speed", "iterations")}
     with np.errstate(all="ignore"):  # damaged rows
         values["mean_speed"] = values["length"] / values["travel_time"]
@@ -100,9 +100,9 @@ def describe(folder: Path) -> dict[str, Any]:
         "rows_wanted": spec.rows,
         "solved": solved.num_rows,
         "failed": dict(Counter(status for status in rows["status"].to_pylist() if status != Status.SOLVED.name)),
-        "certified_as_they_are": int(np.sum(share >= 1.0)),
-        "certified_when_slowed": int(np.sum((share > 0.0) & (share < 1.0))),
-        "never_certified": int(np.sum(share <= 0.0)),
+        "certified_as_they_are": int(np.sum(factor >= 1.0)),
+        "certified_when_slowed": int(np.sum((factor > 0.0) & (factor < 1.0))),
+        "never_certified": int(np.sum(factor <= 0.0)),
         "percentiles": {name: _percentiles(values[name]) for name in DISTRIBUTIONS},
         "active_limits": {name: count / max(1, solved.num_rows) for name, count in active.most_common()},
     }

@@ -267,9 +267,9 @@ class _Run:
         return self.noise[1]
 
     def _rate(self, step: int) -> float:
-        share = (step + 1) / (self.options.epochs * self.batches)
-        rise = min(1.0, share / WARM_UP)
-        fall = 0.5 * (1.0 + np.cos(np.pi * max(0.0, share - WARM_UP) / (1.0 - WARM_UP)))
+        progress = (step + 1) / (self.options.epochs * self.batches)
+        rise = min(1.0, progress / WARM_UP)
+        fall = 0.5 * (1.0 + np.cos(np.pi * max(0.0, progress - WARM_UP) / (1.0 - WARM_UP)))
         return float(self.options.rate * rise * fall)
 
     @torch.no_grad()

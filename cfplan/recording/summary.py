@@ -218,8 +218,8 @@ def _from_then_near(time: NDArray, position: NDArray, goal: NDArray) -> float:
     if not len(outside):
         return float(time[0])
     last = outside[-1]
-    share = (off[last] - SETTLED) / (off[last] - off[last + 1]) if math.isfinite(off[last]) else 1.0
-    return float(time[last] + share * (time[last + 1] - time[last]))
+    fraction = (off[last] - SETTLED) / (off[last] - off[last + 1]) if math.isfinite(off[last]) else 1.0
+    return float(time[last] + fraction * (time[last + 1] - time[last]))
 
 
 def finished(record: Record) -> bool:

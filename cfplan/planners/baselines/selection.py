@@ -29,7 +29,7 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
 def _speed_factor(certificate: Certificate) -> float:
     """Return the factor on speed at which every limit would hold if each usage grew as a power of speed."""
     powers = {quantity.name: quantity.power for quantity in QUANTITIES} | {CAPPED_SPEED: 1}
-    shares = [margin.share ** (1 / powers[margin.name]) for margin in certificate.margins if not margin.passed]
-    if any(np.isnan(share) for share in shares):
+    usages = [margin.share ** (1 / powers[margin.name]) for margin in certificate.margins if not margin.passed]
+    if any(np.isnan(usage) for usage in usages):
         return 0.0
-    return 1.0 / max(shares, default=1.0)
+    return 1.0 / max(usages, default=1.0)

@@ -149,7 +149,7 @@ class _Here(NamedTuple):
 class _Step(NamedTuple):
     v: NDArray
     values: Values
-    share: float
+    alpha_primal: float  # step length
     infeasible: float
     walls: float  # the barrier's cost
     widens: bool  # the filter
@@ -200,15 +200,15 @@ def minimise(
         del near, dg  # so that the next ones get their memory, which the processor's cache still holds
         here = _Here(v, dv, slacks, infeasible, values.cost + walls, slope + direction.slope)
         step = _line_search(program, here, direction, barrier, filtered)
-        if step is None or step.share < search.least_step:
+        if step is None or step.alpha_primal < search.least_step:
             return ended(False, iteration, "no step improves the solution")
         if step.widens:
             filtered.pairs.append(((1 - FILTER) * infeasible, here.merit - FILTER * infeasible))
         v, values, infeasible, walls = step.v, step.values, step.infeasible, step.walls
-        slacks, terms, off = accept_step(values.constraints, bounds, slacks, direction, step.share, barrier)
-        whole = step.share == direction.share_dual == 1.0
+        slacks, terms, off = accept_step(values.constraints, bounds, slacks, direction, step.alpha_primal, barrier)
+        full = step.alpha_primal == direction.alpha_dual == 1.0
         del here, direction
-        if search.predicted_gradient_factor is not None and whole and barrier <= search.last_barrier:
+        if search.predicted_gradient_factor is not None and full and barrier <= search.last_barrier:
             left = search.predicted_gradient_factor * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
                 return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
@@ -249,18 +249,18 @@ def _line_search(
     program: NonlinearProgram, here: _Here, direction: SearchDirection, barrier: float, filtered: _Filter
 ) -> _Step | None:
     """Halve the step until the filter takes it; None where it never does."""
-    share = direction.share
+    alpha = direction.alpha_primal
     for _ in range(HALVINGS):
-        there = here.v + share * here.dv
+        there = here.v + alpha * here.dv
         values = program.evaluate(there)
         infeasible, walls = merit_terms(
-            values.constraints, program.bounds, here.slacks, direction.step, share, barrier, program.rows
+            values.constraints, program.bounds, here.slacks, direction.step, alpha, barrier, program.rows
         )
         if verdict := filtered.judge(
-            (here.infeasible, here.merit), (infeasible, values.cost + walls), share * here.slope
+            (here.infeasible, here.merit), (infeasible, values.cost + walls), alpha * here.slope
         ):
-            return _Step(there, values, share, infeasible, walls, verdict == "widens")
-        share /= 2
+            return _Step(there, values, alpha, infeasible, walls, verdict == "widens")
+        alpha /= 2
     return None
 
 

@@ -1,7 +1,7 @@
 """Draw a flight as a rerun recording: room, path and vehicle in 3-D, plots with their limits, phases and events.
 
-Everything is sent as whole columns after the flight; the stream's process never sees any of this. All times are seconds
-since the record's first message, on the one timeline `flight`.
+Everything is sent as complete columns after the flight; the stream's process never sees any of this. All times are
+seconds since the record's first message, on the one timeline `flight`.
 """
 
 from collections.abc import Sequence
