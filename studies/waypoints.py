@@ -64,7 +64,7 @@ class ChosenFlight:
     duration: float  # s; NaN where there is no flight
     min_snap: float  # s, along the better path of least snap; NaN where that cannot be flown
     point_mass: float  # s, of a point mass; NaN where that was not computed
-    excursion: float  # m, how far the path leads out of the box of the waypoints
+    excursion: float  # m, by which the path leaves the box of the waypoints
     seconds: float  # of processor time, to choose the path and certify it
     certified: bool
     refused: str  # why it is not flown; empty if it is
@@ -131,7 +131,7 @@ def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> Cho
 
 
 def _measure_furnished(seed: int, limits: Limits) -> ChosenFlight:
-    """Plan a flight among obstacles, and let it give way for link loss and stops; measure how near it comes to them."""
+    """Plan a flight among obstacles, and let it give way for link loss and stops; measure its clearance from them."""
     space, points = furnished_room(seed, limits.space)
     begun = time.process_time()
     planned, refused, least, lost = None, "", math.nan, ""

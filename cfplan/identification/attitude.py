@@ -33,7 +33,7 @@ _SMOOTHING = 0.25  # s, by which the slow difference of poses and gyroscope is s
 class AttitudeFit:
     """The fit of the gyroscope to the poses; deviations are standard deviations."""
 
-    shift: float  # s by which poses are later than their dates say
+    shift: float  # s, delay of the poses behind their time stamps
     shift_deviation: float
     mounting: NDArray  # (3,) rad, rotation vector from the vehicle's axes to the markers' body's
     mounting_deviation: NDArray  # (3,) rad

@@ -31,7 +31,7 @@ class CollectiveCommand:
     signals: FlightSignals
     grid: NDArray
     estimate: NDArray  # (K, 9) position, velocity, thrust axis as estimated on board
-    delays: tuple[float, float]  # s, the least and the most that the log's samples allow
+    delays: tuple[float, float]  # s, least and largest that the log's samples allow
 
     def at(self, delay: float, phase: float) -> NDArray:
         """Return the command on the grid.

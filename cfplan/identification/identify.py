@@ -17,7 +17,7 @@ from cfplan.identification.translation import BATTERY, LINEAR, FittedUnknowns, F
 from cfplan.recording.record import Record
 
 _POSE_NOISE = 1e-3  # m, unit of the misfit in the search; the uncertainties use the remaining misfit
-_SHIFT_STD = 0.5e-3  # s, of the shift beyond what the gyroscope's noise says
+_SHIFT_STD = 0.5e-3  # s, of the shift, besides the effect of the gyroscope's noise
 _BATTERY_PRIOR = 0.1  # 1/V, standard deviation of the relative change of thrust: firmware makes up for the voltage
 _LAG_RANGE = (0.01, 0.3)  # s, between which the motor lag is sought
 _MAX_SHIFT = 0.1  # s, at most

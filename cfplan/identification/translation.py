@@ -29,7 +29,7 @@ THRUST, DRAG, AXIAL_DRAG, ORIGIN, BATTERY = slice(0, 3), 3, 4, slice(5, 8), 8
 LINEAR = 9
 _MIN_COVERAGE = 0.6  # fraction of a window's poses that must be present
 _LONGEST_GAP = 0.06  # s without a pose or a status, in a window that counts
-_VOLTAGE_SMOOTHING = 2.0  # s over which the voltage is averaged: its sag under load is no state of charge
+_VOLTAGE_SMOOTHING = 2.0  # s over which the voltage is averaged: sag under load does not reflect the state of charge
 _VELOCITY_WINDOW = 15  # poses through which a cubic is drawn for the velocity that drag acts on
 
 

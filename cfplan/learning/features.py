@@ -40,11 +40,11 @@ NUMBERS = (
     "angular velocity",  # times v/g
     "angular acceleration",  # times v²/g²; at most twice what motors give
     "thrust upwards",  # largest over weight, less 1
-    "thrust downwards",  # 1 less the least over weight
+    "thrust downwards",  # 1 less the smallest over weight
     "roll authority",  # angular acceleration that motors give about each axis, times v²/g²
     "pitch authority",
     "yaw authority",
-    "specific thrust",  # the least, over g
+    "specific thrust",  # smallest, over g
     "tilt",  # rad
     "drag across",  # along body x and y, times v over the weight
     "drag along",  # along the thrust

@@ -46,7 +46,7 @@ SPACING = 0.2  # m between the nodes of a query, about as in training
 
 
 class ProposedProfile(NamedTuple):
-    """What a network proposes for a path."""
+    """A network's proposal for a path."""
 
     coefficients: NDArray  # (N+3,) of the spline of h; not finite where the network fails
     yaw: NDArray  # (N+1,) rad at the nodes: the track's where there is one

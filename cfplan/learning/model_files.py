@@ -182,7 +182,7 @@ def models_folder() -> Path:
 
 
 def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...] = ()) -> Model | None:
-    """Load the model that knows this vehicle and these limits best.
+    """Load the model whose training ranges suit this vehicle and these limits best.
 
     `folders` are searched before the models of cfplan; each holds models, or is itself a model, which is then taken.
     Taken is a model whose ranges contain vehicle and limits, from the first folder with one, and there the one with the
@@ -220,7 +220,7 @@ def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...], ver
 
 
 def _distance(card: Card, known: ScaledLimits) -> float:
-    """Return how far numbers lie outside of a model's ranges; 0 within."""
+    """Return the distance of numbers from a model's ranges; 0 within."""
     total = 0.0
     for here, (low, high) in zip(known.numbers, card.ranges.values(), strict=True):
         width = max(high - low, 1e-3)

@@ -37,7 +37,7 @@ class PlanningTask:
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
-    dispensable: bool = field(default=False, compare=False, repr=False)  # given up where it is late: others answered
+    dispensable: bool = field(default=False, compare=False, repr=False)  # abandoned at the deadline: others answered
     models: tuple[pathlib.Path, ...] = ()  # of the learned planner: folders of models, or one of a model itself
     refusal: Solution | None = field(init=False, compare=False, repr=False)
     """The solution of a planner that keeps all limits and boundary states, if no search is needed to see that none can
@@ -81,7 +81,7 @@ class PlanningTask:
         """Refuse fewer nodes than the path's shape needs; for planners that lay a spline over the grid.
 
         Raises:
-            InputError: too few nodes; says how many are enough.
+            InputError: too few nodes; the hint names the least number.
         """
         pieces = len(self.path.breaks) - 1
         least = max(LEAST_NODES, NODES_PER_PIECE * pieces)

@@ -80,7 +80,7 @@ class Alignment:
     aside: tuple[float, float, float]  # m, mean of the log minus the plan
     max_deviation: float  # m
     rms_deviation: float  # m
-    alike: bool  # whether the log looks like a flight of the plan at all
+    alike: bool  # whether the log resembles a flight of the plan
 
     def __str__(self) -> str:
         return (

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.numbers import coordinates
 
-LONGEST = 12 * 3600.0  # s, from the first time to the last; more cost memory and minutes wherever times are compared
+LONGEST = 12 * 3600.0  # s, from the first time to the last; longer spans cost memory and minutes in comparing times
 _LATEST = 1e11  # s; microseconds taken for seconds are later
 _FARTHEST = 1e4  # m, from the origin
 _LARGEST = 1e11  # of any number, in SI; squares of larger ones would overflow in drawing

@@ -166,7 +166,7 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
 def estimated_speed(record: Record, begin: float, end: float) -> float:
     """Return the fraction by which the vehicle's estimate is faster than the poses between begin and end.
 
-    A vehicle that believes itself slower than it is flies ahead of its setpoints. NaN where nothing moves or is known.
+    A vehicle whose estimate is too slow flies ahead of its setpoints. NaN if nothing moves or is known.
     """
     estimates, time = record.estimates, record.poses.time
     seen = np.isfinite(time) & np.all(np.isfinite(record.poses.position), axis=1)
@@ -184,7 +184,7 @@ def estimated_speed(record: Record, begin: float, end: float) -> float:
 def settling(record: Record) -> float:
     """Return s after the end of the reference until the vehicle, held at the path's end, stays within SETTLED of it.
 
-    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
+    NaN if the path was not finished, there is no pose, or the vehicle was still outside at the end.
     """
     return max(arrival(record)[0] - reference_span(record)[1], 0.0)
 
@@ -192,7 +192,7 @@ def settling(record: Record) -> float:
 def arrival(record: Record) -> tuple[float, float]:
     """Return the times, s, from which on the vehicle, and its setpoints, stay within SETTLED of the path's end.
 
-    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
+    NaN if the path was not finished, there is no pose, or the vehicle was still outside at the end.
     """
     begin, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)

@@ -53,4 +53,4 @@ class FlightInProgress(Protocol):
         """
 
     def close(self) -> None:
-        """Release the vehicle; a flight that goes on is landed first. May be called twice."""
+        """Release the vehicle; a flight in progress is landed first. May be called twice."""

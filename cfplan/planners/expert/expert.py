@@ -80,7 +80,7 @@ def plan_early(task: PlanningTask, enough: float = TUNING.enough) -> Solution:
 def can_begin(task: PlanningTask) -> bool:
     """Return whether the beginning of a task that starts in motion can be planned, regardless of the rest.
 
-    If it cannot, the task has no plan; if it can, there mostly is a plan, as the vehicle may fly slower farther on.
+    If it cannot, the task has no plan; if it can, there usually is one, as the vehicle may fly slower farther on.
     In marginal cases one of the two searches may fail alone: of 6,245 paths that began in motion the answer was right
     for 6,240, in half the time that plan_early() takes to fail, and a fifth of the time that it takes to succeed.
     """
@@ -109,7 +109,7 @@ def refinements(
 ) -> Iterator[Solution]:
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
-    The first mostly passes the certificate. A path longer than `window` is planned window by window and yields one
+    The first usually passes the certificate. A path longer than `window` is planned window by window and yields one
     profile, after all rounds. A failure is the only item. After the task's deadline the rest stays as given.
     """
     began, nodes = time.perf_counter(), len(profile.s) - 1

@@ -78,7 +78,7 @@ class Tuning(NamedTuple):
     fallback_barrier_factor: float = 8.0  # 0.3 % from the optimum: for a search that does not end otherwise, and under
     # caps, which giving way finds step by step: from profiles at their limits it finds lower ones
     initial_h_reduction: float = 0.1  # fraction of h that refining begins below: constraints begin inside their bounds
-    stall_iterations: int = 16  # from which a search may have stopped 3 % short, and goes on once more
+    stall_iterations: int = 16  # after which a search may have stalled 3 % from the optimum, and is continued once
 
     # Windows, windows.py
     window: WindowSize = WindowSize(kept=96, ahead=24)  # longer windows take more iterations

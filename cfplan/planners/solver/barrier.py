@@ -33,7 +33,7 @@ _LANES = 16  # numbers that the processor may compare at once
 
 
 class Errors(NamedTuple):
-    """How far slacks and multipliers are from the solution of the barrier's problem."""
+    """The distance of slacks and multipliers from the solution of the barrier problem."""
 
     infeasibility: float  # the largest |g - s|
     complementarity: float  # the largest difference of a slack's product with its multiplier from the barrier
@@ -210,7 +210,7 @@ def accept_step(
 ) -> tuple[NDArray, NDArray, Errors]:
     """Return (slacks, terms, Errors) after a step of length `alpha_primal` of the slacks, which led to g.
 
-    Multipliers go as far as they may, and stay within a factor of what the barrier makes of their slacks.
+    Multipliers take their full step length, and stay within COMPLEMENTARY of those that the barrier prescribes.
     """
     after, terms = np.empty_like(slacks), np.empty((4, len(g)))
     step, alpha_dual = direction.step, direction.alpha_dual

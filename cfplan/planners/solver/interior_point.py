@@ -1,7 +1,7 @@
 """A primal-dual interior point method for nonlinear programs with a banded Newton matrix.
 
-Where variables are spline coefficients there are no equations to keep, and a coefficient meets only its neighbours: the
-Newton matrix is banded, and factoring it costs less than evaluating the functions. With slacks s for the constraints,
+If variables are spline coefficients there are no equality constraints, and a coefficient is coupled only to neighbours:
+the Newton matrix is banded, and factoring it costs less than evaluating the functions. With slacks s for constraints,
 
     minimise f(v)   subject to   g(v) = s,   lower ≤ s ≤ upper,
 
@@ -86,7 +86,7 @@ class Search:
     feasibility: float = 1e-5  # of the constraints, at the end
     predicted_gradient_factor: float | None = None  # of the gradient, left by a full step; None: always computed
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
-    multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
+    multipliers: float = 1.0  # at first, times those that the barrier prescribes for their slacks
     iterations: int = 100
     least_step: float = 0.0  # fraction of a Newton step; one that must be shorter is the last: there may be no solution
 
@@ -161,8 +161,8 @@ def minimise(
 ) -> SearchResult:  # fmt: skip
     """Search from v, where the functions must be defined, until the deadline.
 
-    With the multipliers `known` from a search of nearly the same problem, whose bounds alone may differ, it goes on
-    where that one ended; else it begins with what the barrier makes of its slacks.
+    With the multipliers `known` from a search of a problem that differs at most in its bounds, it continues that
+    search; else it begins with the multipliers that the barrier prescribes.
     """
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
@@ -265,7 +265,7 @@ def _line_search(
 
 
 def _error(off: Errors, off_gradient: float, search: Search) -> float:
-    """Return how far this is from the barrier's solution, in units of the barrier."""
+    """Return the distance from the barrier's solution, in units of the barrier."""
     return max(
         off.infeasibility / search.feasibility * search.last_barrier,
         off_gradient / search.gradient * search.last_barrier,

@@ -38,7 +38,7 @@ _FORM = "as in udp:127.0.0.1:14550, where the ground station listens"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the ground station is."""
+    """The address of the ground station."""
 
     host: str
     port: int

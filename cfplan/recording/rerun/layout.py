@@ -46,7 +46,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below.
 
-    All plots show `span`, s on the timeline, where it is given: a flight that goes on has none.
+    All plots show `span`, s on the timeline, if it is given: a flight in progress has none.
     """
     grid = rrb.Grid(*(time_plot(name, title, span) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(

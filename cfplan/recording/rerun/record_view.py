@@ -36,7 +36,7 @@ from cfplan.vehicle.rotations import about_z
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
 LARGEST_FLOOR = 100.0  # m, from the origin, that is drawn
 STRIPS_AT_ONCE = 500  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
-BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
+BODY_SCALE = 4.0  # the vehicle is enlarged, to be visible in its room
 TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
 HOVER_ARROW = 0.35  # m, of the thrust in hover
 THRUST_COLOUR: Colour = (240, 228, 66)

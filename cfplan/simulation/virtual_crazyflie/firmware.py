@@ -25,8 +25,8 @@ class Firmware(Protocol):
         as a perfect low-pass filter would leave it. The arrays are used again: copy what must last. `voltage` is that
         of the battery under load, V.
 
-        Commands are fractions of the airframe's largest thrust, times 65,535. None says that nothing asks the motors to
-        turn, as without a setpoint or where the supervisor stops them: the lab counts such time in the air.
+        Commands are fractions of the airframe's largest thrust, times 65,535. None means that nothing commands the
+        motors to turn, as without a setpoint or where the supervisor stops them: the lab counts such time in the air.
         """
 
     def receive(self, packet: bytes) -> None:

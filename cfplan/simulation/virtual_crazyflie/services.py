@@ -1,4 +1,4 @@
-"""Services that a client asks for first: link and versions (CRTP ports 15 and 13), and memories (port 4)."""
+"""Services that a client requests first: link and versions (CRTP ports 15 and 13), and memories (port 4)."""
 
 from struct import unpack_from
 

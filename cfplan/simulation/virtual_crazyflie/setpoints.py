@@ -23,7 +23,7 @@ from cfplan.simulation.engine.mellinger import (
     VELOCITY_MODE,
 )
 
-# Where each value lies, as in `mellinger`.
+# Place of each value, as in `mellinger`.
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 QUATERNION, BODY_RATE = slice(9, 13), slice(13, 16)
 ROLL, PITCH, YAW, THRUST = range(16, 20)
@@ -47,7 +47,7 @@ class FirmwareAssert(Exception):
 
 @dataclass(slots=True)
 class Setpoint:
-    """Values and modes as in `mellinger`; a new one asks for nothing: motors off."""
+    """Values and modes as in `mellinger`; a new one is null: motors off."""
 
     values: NDArray = field(default_factory=lambda: np.zeros(SETPOINT_SIZE))  # (20,)
     mode: NDArray = field(default_factory=lambda: np.array(NOTHING))  # (7,)
@@ -56,7 +56,7 @@ class Setpoint:
 
 
 def decode_setpoint(payload: bytes) -> Setpoint:
-    """Decode a packet of port 7, channel 0; an unknown type asks for nothing.
+    """Decode a packet of port 7, channel 0; an unknown type gives a null setpoint.
 
     Raises FirmwareAssert on a wrong length.
     """

@@ -115,7 +115,7 @@ class Stabilizer:
         self._switches[_IN_BODY:] = setpoint.velocity_in_body, allowed, flying, asked, self.mellinger
 
     def run(self, tick: int, gyroscope: NDArray, accelerometer: NDArray, poses: NDArray) -> NDArray | None:
-        """Run for the millisecond `tick`; return the motors' commands, (4,) 16 bits, None if nothing asks for any.
+        """Run for the millisecond `tick`; return the motors' commands, (4,) 16 bits, None if there is no command.
 
         `gyroscope` (3,) rad/s and `accelerometer` (3,) m/s² as measured; `poses` (n, 9) as in `kalman`.
         """
