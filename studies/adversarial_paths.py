@@ -21,7 +21,7 @@ from cfplan.safety.limits import PlanLimits
 FACTORS = (0.01, 10.0)  # range of the factors on the limits
 SCALED = ("speed", "acceleration", "angular_velocity", "angular_acceleration")
 STEEPEST = math.radians(80.0)  # rad, largest tilt drawn
-MOST_TIME = 1800.0  # s at the speed limit; the limits of slower paths are drawn again
+MAX_TIME = 1800.0  # s at the speed limit; the limits of slower paths are drawn again
 Draw = Callable[[np.random.Generator], NDArray]
 
 
@@ -59,7 +59,7 @@ def adversarial_path(seed: int, usual: PlanLimits) -> AdversarialPath:
         limits = replace(
             usual, **{name: float(f) * getattr(usual, name) for name, f in zip(SCALED, factors, strict=True)}
         )
-        if length <= MOST_TIME * limits.speed:
+        if length <= MAX_TIME * limits.speed:
             break
     if random.random() < 0.25:
         tilt = usual.tilt * math.exp(random.uniform(math.log(FACTORS[0]), math.log(FACTORS[1])))

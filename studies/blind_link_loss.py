@@ -1,6 +1,6 @@
 """Lose link and poses on drawn vehicles that fly on their estimate, along each PATH; compare with the swept boxes.
 
-Planning keeps a vehicle inside the walls that knows its state, and widens the box that this vehicle sweeps by the
+Planning keeps a vehicle that knows its state inside the walls, and widens the box that the vehicle sweeps by the
 allowances of `link_loss` in safety.yaml for errors of the estimate. Here the errors are those of the simulated Kalman
 filter on vehicles drawn as for the dry run, from evenly spaced moments of each flight.
 """
@@ -26,7 +26,7 @@ from studies.runner.options import argument, option
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-_NEAR = 0.02  # m, out of the box; planning aims at so much inside the walls
+_NEAR = 0.02  # m, out of the box; planning keeps the same distance inside the walls
 _WITHOUT_DRAG = 2025, 12  # a firmware whose filter has no model of rotor drag
 _LONGEST = 4.0  # s from the last setpoint until every vehicle lies on the floor
 

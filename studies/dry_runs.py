@@ -26,8 +26,8 @@ class Settings:
     path_files: tuple[Path, ...] = argument()
 
 
-def _key(lag: float, share: str) -> str:
-    return f"deviation_{share}_{1000 * lag:g}_ms"
+def _key(lag: float, percentile: str) -> str:
+    return f"deviation_{percentile}_{1000 * lag:g}_ms"
 
 
 COLUMNS = (

@@ -252,7 +252,7 @@ def fly_stepped(
 def _strike(
     scenario: Scenario, lab: SteppedLab, flown: SteppedFlight, orders: HeldOrders, planner: SteppedPlanner | None
 ) -> None:
-    """Do now what a scenario does to a flight, or set it up for later."""
+    """Apply the faults and orders of a scenario now, or schedule them."""
 
     def kill() -> None:
         if flown.ended:

@@ -55,7 +55,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class SlowedFlight:
-    """One path: how far beyond the walls the vehicle comes down, for the worst setpoint and lag; negative inside."""
+    """One path, and how far beyond the walls the vehicle comes down at the worst setpoint and lag; negative inside."""
 
     path: str  # its name, or RANDOM
     flight: str

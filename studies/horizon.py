@@ -1,8 +1,8 @@
 """Plan along random waypoints with only the next few known, and measure the time lost against knowing all of them.
 
 Each time a waypoint is passed, the next one is revealed and the plan is continued through it from a joint near the
-passed one, as requests in flight do. A plan always ends at rest at the last known waypoint. The reference is the plan
-along the path through all waypoints that is flown soonest, made before take-off.
+passed one, as requests in flight do. A plan always ends at rest at the last known waypoint. The reference is the
+fastest plan along a path through all waypoints, made before take-off.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,4 +1,4 @@
-"""Predict the public flights in FOLDER by the dry run's physics, and compare with what the vehicles did.
+"""Predict the public flights in FOLDER by the dry run's physics, and compare with the measured motion.
 
 Each flight starts from its log's first record and is flown closed loop with the gains that flew. Nothing is fitted to
 the deviation. Held out: parameters are those of other flights of the family; only the thrust scale is the flight's own,
@@ -33,7 +33,7 @@ _AIRFRAMES = {
     "brushless, Lee": "crazyflie-2.1-brushless", "brushed upgrade, Lee": "crazyflie-thrust-upgrade",
     "brushed, Lee": "crazyflie-2.1+", "brushed, Mellinger": "crazyflie-2.1+",
 }  # fmt: skip
-# 1/V: 3.9 % of thrust per 0.1 V is what public flights without battery compensation lose.
+# 1/V: public flights without battery compensation lose 3.9 % of thrust per 0.1 V.
 _WITHOUT_COMPENSATION, _SAG = ("brushless, Lee",), 0.39
 
 
@@ -84,7 +84,7 @@ class PredictedFlight:
 
 
 def airframe_of(flight: PublicFlight) -> Airframe:
-    """Return what is known of a flight's vehicle without flying it: its kind, and its mass as weighed."""
+    """Return the prior knowledge of a flight's vehicle: its kind, and its mass as weighed."""
     kind = AIRFRAMES[_AIRFRAMES[flight.family]]
     return replace(
         kind,

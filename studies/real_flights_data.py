@@ -99,11 +99,11 @@ def _control(data: dict[str, NDArray], family: str) -> NDArray:
     """Return thrust and torques, (N, 4), that the controller asked for: logged, or by the motors' PWM."""
     if "thrust_command" in data:
         return np.column_stack([data["thrust_command"], data["torque_command"]]).astype(float)
-    share = data["pwm"] / FULL
+    fraction = data["pwm"] / FULL
     if family.startswith("brushless"):
-        motors = _inverse(share, _BRUSHLESS_PWM) * 1e-3 * GRAVITY
+        motors = _inverse(fraction, _BRUSHLESS_PWM) * 1e-3 * GRAVITY
     else:
-        volts = share * data["vbat"][:, None]
+        volts = fraction * data["vbat"][:, None]
         motors = _inverse(volts, (0.0, *_BRUSHED_VOLTS)) / _BRUSHED_FULL * (FULL + 1) / (4 * MASS_THRUST)
     levers = (ARM, ARM, THRUST_TO_TORQUE)
     return np.column_stack([motors.sum(axis=1), *(lever * motors @ signs for lever, signs in

@@ -1,7 +1,8 @@
-"""Subtract what the other flights of a plan teach from each public flight in FOLDER whose plan was flown several times.
+"""Learn a correction from the other flights of a plan, and subtract it from each public flight in FOLDER.
 
-The others' deviations by motion capture are fitted as `cfplan fly --after` fits them, and the mean is subtracted. That
-is left of a second flight if the vehicle follows its correction. The logs are not kept here.
+The others' deviations by motion capture are fitted as `cfplan fly --after` fits them, and the mean is subtracted. The
+remainder is the deviation of a second flight if the vehicle follows its correction. Plans flown only once are
+left out. The logs are not kept here.
 """
 
 import json
@@ -24,7 +25,7 @@ from studies.runner.reductions import count, rms
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-_END = 1.0  # s before the plan's end, in which the shift goes over to what suits the hover
+_END = 1.0  # s before the plan's end, in which the shift changes to that of the hover
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class SecondFlight:
 
 
 class _Flown(NamedTuple):
-    """How a vehicle deviated in one flight."""
+    """The deviation of a vehicle in one flight."""
 
     time: NDArray  # (N,) s from the plan's start, to HOVER after its end
     off: NDArray  # (N, 3) m
@@ -89,7 +90,7 @@ def measure(case: tuple[str, Path, list[Path]]) -> SecondFlight:
 
 
 def _ends(file: Path) -> float:
-    """Return when a flight's plan ends, s from its start: when the reference moves last."""
+    """Return the end of a flight's plan, s from its start: when the reference moves last."""
     reference = read_flight(file).reference
     moves = np.flatnonzero(np.any(np.diff(reference.rows[:, POSITION], axis=0) != 0.0, axis=1))
     return float(reference.time[moves[-1] + 1]) - _start(file)
@@ -100,7 +101,7 @@ def _start(file: Path) -> float:
 
 
 def _flown(file: Path, duration: float) -> _Flown:
-    """Return how a flight deviated. Raises InputError where motion capture misses longer than is learned from."""
+    """Return the deviation of a flight. Raises InputError if motion capture has too long a gap to learn from it."""
     flight, start = read_flight(file), _start(file)
     log, reference = flight.log, flight.reference
     time = log.pose_time - start

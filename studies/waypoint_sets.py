@@ -89,8 +89,8 @@ def _on_a_line(random: Random) -> NDArray:
 
 def _there_and_back(random: Random) -> NDArray:
     first, last, elsewhere = random.uniform(ROOM[0], ROOM[1], (3, 3))
-    share = random.uniform(0.1, 1.0)
-    turned = [first, last, last + (first - last) * share]
+    fraction = random.uniform(0.1, 1.0)
+    turned = [first, last, last + (first - last) * fraction]
     return np.array([*turned, elsewhere] if random.random() < 0.5 else turned)
 
 

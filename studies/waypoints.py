@@ -40,7 +40,7 @@ AROUND = 0.35  # m between the box of the waypoints and the walls of a tight roo
 HALL_KIND = list(KINDS)[1]
 _BESIDE = 0.2  # m between the waypoints in a hall and its walls
 _AROUND_TRACKS = 2.0  # m between the waypoints of a track and its walls
-_ROUNDING = 1e-9  # share of a time
+_ROUNDING = 1e-9  # fraction of a time
 _FEW = 10  # waypoints, up to which times are compared
 
 
@@ -64,7 +64,7 @@ class ChosenFlight:
     duration: float  # s; NaN where there is no flight
     min_snap: float  # s, along the better path of least snap; NaN where that cannot be flown
     point_mass: float  # s, of a point mass; NaN where that was not computed
-    excursion: float  # m, how far the path leads out of the box of the waypoints
+    excursion: float  # m, by which the path leaves the box of the waypoints
     seconds: float  # of processor time, to choose the path and certify it
     certified: bool
     refused: str  # why it is not flown; empty if it is
@@ -74,12 +74,12 @@ class ChosenFlight:
 
     @property
     def over(self) -> float:
-        """Return by which share the flight takes longer than the point mass."""
+        """Return the relative excess of the flight's time over that of the point mass."""
         return self.duration / self.point_mass - 1.0
 
     @property
     def saved(self) -> float:
-        """Return the share of the time along min-snap that is saved."""
+        """Return the fraction of the time along min-snap that is saved."""
         return 1.0 - self.duration / self.min_snap
 
     @property
@@ -131,7 +131,7 @@ def measure(case: tuple[str, int | str], limits: Limits, distance: float) -> Cho
 
 
 def _measure_furnished(seed: int, limits: Limits) -> ChosenFlight:
-    """Plan a flight among obstacles, and let it give way for link loss and stops; measure how near it comes to them."""
+    """Plan a flight among obstacles, and let it give way for link loss and stops; measure its clearance from them."""
     space, points = furnished_room(seed, limits.space)
     begun = time.process_time()
     planned, refused, least, lost = None, "", math.nan, ""

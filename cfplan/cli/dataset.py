@@ -196,7 +196,7 @@ def info(folder: Path, as_json: bool) -> None:
         values = found["percentiles"][name]
         rows.append([f"{name.replace('_', ' ')} {unit}".strip(), *(_short(values[str(p)]) for p in PERCENTILES)])
     print_table("Distributions", ["", *(f"p{p}" for p in PERCENTILES)], rows)
-    active = [[name, f"{100 * share:.1f} %"] for name, share in found["active_limits"].items()]
+    active = [[name, f"{100 * fraction:.1f} %"] for name, fraction in found["active_limits"].items()]
     print_table("Limits that are active somewhere on the path", ["limit", "of solved paths"], active)
 
 

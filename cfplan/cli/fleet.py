@@ -43,7 +43,7 @@ def refuse_output(output: Path | None) -> None:
 def plan_and_print(
     file: Path, safety_file: Path | None, planning: dict[str, Any], figure: Path | None, force: bool, steps: Steps
 ) -> None:
-    """Plan a fleet, draw it in a figure if one is named, and print who starts when and how near each pair comes."""
+    """Plan a fleet, draw it in a figure if one is named, and print all starts and the nearest approach of each pair."""
     fleet = _planned(file, safety_file, planning, steps)
     if figure is not None:
         from cfplan.planning.figure import save_figure
@@ -59,7 +59,7 @@ def plan_and_print(
 
 
 def rehearse_and_print(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> None:
-    """Plan a fleet, make the dry run of each vehicle and lose its link; print what plan_and_print() does and these."""
+    """Plan a fleet, rehearse each vehicle, also with link loss, and print results after those of plan_and_print()."""
     fleet = _planned(file, safety_file, planning, steps)
     with steps.waiting("loading simulator"):
         from cfplan.preparation.plan_fleet import rehearse_fleet

@@ -142,7 +142,7 @@ def _preparation(
 ) -> "Callable[..., Prepared]":  # fmt: skip
     """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others.
 
-    Raises InputError where an option asks for a new plan after others.
+    Raises InputError if an option requires a new plan with --after.
     """
     from cfplan.preparation.on_board_flight import prepare_on_board_flight
     from cfplan.preparation.prepare_flight import prepare_flight
@@ -155,7 +155,7 @@ def _preparation(
 
 
 def _require_no_new_plan(planning: dict[str, Any]) -> None:
-    """Raise InputError where an option asks for a plan other than that of the records of --after."""
+    """Raise InputError if an option requires another plan than that of the records of --after."""
     chosen = [f"--{name}" for name in ("nodes", "model") if planning[name] is not None]
     chosen += ["--speed"] if planning["speed_factor"] is not None else []
     chosen += ["--planner"] if planning["planner"] != "auto" else []
@@ -184,7 +184,7 @@ def _prepare_again(
 
 
 def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board: bool, after: tuple[Path, ...]) -> str:
-    """Return where waypoints come from. Raises InputError unless they alone say where to fly."""
+    """Return the source of waypoints. Raises InputError unless it is the only source of the path."""
     if after and lines is not None:
         raise InputError(
             "waypoints received in flight make a new plan", where="--after", hint="name the path of the records"

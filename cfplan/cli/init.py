@@ -10,7 +10,7 @@ from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
 
 _ROOM = "4.5x8x2"
-_LEAST_SIDE, _LEAST_HEIGHT, _MOST_SIDE, _MOST_HEIGHT = 1.5, 1.2, 60.0, 30.0  # m; setpoints hold 32 m
+_MIN_SIDE, _MIN_HEIGHT, _MAX_SIDE, _MAX_HEIGHT = 1.5, 1.2, 60.0, 30.0  # m; setpoints hold 32 m
 _CLIMB = 0.5  # m, at most
 _FILL = 0.6  # fraction of the room within the margin that the first path fills; link loss needs the rest
 _PATH_FILE, _AIRFRAME_FILE = "first.yaml", "airframe.yaml"
@@ -65,11 +65,11 @@ def _sides(text: str) -> tuple[float, float, float]:
         raise InputError(
             f"{text!r} is not a room size", where="--room", hint=f"write length x width x height, as {_ROOM}"
         ) from None
-    if not (min(x, y) >= _LEAST_SIDE and max(x, y) <= _MOST_SIDE and _LEAST_HEIGHT <= z <= _MOST_HEIGHT):
+    if not (min(x, y) >= _MIN_SIDE and max(x, y) <= _MAX_SIDE and _MIN_HEIGHT <= z <= _MAX_HEIGHT):
         raise InputError(
             f"a room of {x:g} m by {y:g} m, {z:g} m high",
             where="--room",
-            hint=f"write metres: {_LEAST_SIDE:g} to {_MOST_SIDE:g} a side, {_LEAST_HEIGHT:g} to {_MOST_HEIGHT:g} high",
+            hint=f"write metres: {_MIN_SIDE:g} to {_MAX_SIDE:g} a side, {_MIN_HEIGHT:g} to {_MAX_HEIGHT:g} high",
         )
     return x, y, z
 

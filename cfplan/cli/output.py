@@ -102,7 +102,7 @@ def _compiling_here() -> str:
 
 
 class _WaitingNote:
-    """Prints repeatedly what a command waits for."""
+    """Prints the step that a command waits for, repeatedly."""
 
     def __init__(self, name: str, steps: Steps, clock: Clock):
         self._name, self._steps, self._clock = name, steps, clock

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 def read_fleet(folder: Path, steps: Steps) -> "FleetRecord":
-    """Read the records of a fleet, and say what is missing and how near each pair came."""
+    """Read the records of a fleet, and report missing ones and the nearest approach of each pair."""
     from cfplan.recording.fleet_record import read_fleet_record
 
     with steps.step("read") as results:

@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-_LEAST_TEXT = 12  # characters, least width to which a column of text is wrapped
-_LONGEST_NUMBER = 24  # characters, with its unit; longer cells are sentences that begin with a number
+_MIN_TEXT_WIDTH = 12  # characters, least width to which a column of text is wrapped
+_MAX_NUMBER_WIDTH = 24  # characters, with its unit; longer cells are sentences that begin with a number
 _NUMBER = re.compile(r"[-+–(≤≥<>]?\s*\d.*|[-–]?")
 _UNBOUNDED = 100_000  # characters, width of a console that fits any table
 
@@ -54,7 +54,7 @@ def _table(columns: Sequence[str], rows: Rows) -> Table:
     table = Table(header_style="bold", box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False, pad_edge=False)
     for index, column in enumerate(columns):
         cells = [row[index] for row in rows]
-        numeric = index > 0 and all(_NUMBER.fullmatch(cell) and len(cell) <= _LONGEST_NUMBER for cell in cells)
+        numeric = index > 0 and all(_NUMBER.fullmatch(cell) and len(cell) <= _MAX_NUMBER_WIDTH for cell in cells)
         least = _least_width(column, cells, numeric=numeric)
         table.add_column(Text(column), justify="right" if numeric else "left", min_width=least)
     for row in rows:
@@ -65,7 +65,7 @@ def _table(columns: Sequence[str], rows: Rows) -> Table:
 def _least_width(column: str, cells: Sequence[str], *, numeric: bool) -> int:
     """Return the least width of a column: that of its longest number or word, and more for text."""
     words = _longest(" ".join((column, *cells)).split())
-    return max(words, _longest(cells) if numeric else min(_LEAST_TEXT, _longest((column, *cells))))
+    return max(words, _longest(cells) if numeric else min(_MIN_TEXT_WIDTH, _longest((column, *cells))))
 
 
 def _longest(texts: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""`cfplan validate`: predict logged flights, and compare with what the vehicle did."""
+"""`cfplan validate`: predict logged flights, and compare with the logs."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from cfplan.identification.validate import Validation
 
 AIRFRAME_FILE = Path("airframe.yaml")
-_USUAL = "crazyflie-2.1+"
+_DEFAULT_VEHICLE = "crazyflie-2.1+"
 
 
 @click.command(
@@ -108,7 +108,7 @@ def _read(
         hint = "write those that flew to a YAML file: --gains FILE"
         raise InputError("its gains are not known", where=str(place), hint=hint)
     controller = read_gains(gains)
-    known = airframe or load_airframe(_USUAL)
+    known = airframe or load_airframe(_DEFAULT_VEHICLE)
     weighed = replace(known, mass=mass or (known.mass if airframe else controller.gains.mass))
     log = read_microsd(place).between(begin, end)
     return flight_of_log(log, controller, weighed, _trajectory(polynomials, time_scale, plan), offset)

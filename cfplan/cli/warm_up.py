@@ -9,9 +9,9 @@ from cfplan.errors import InputError
 
 
 def warm_up(safety_file: Path, steps: Steps) -> None:
-    """Fly each part of the small flight in a process of its own, and then all of it, as a step of a command.
+    """Fly each part of the small flight in its own process, and then all of it, as a step of a command.
 
-    Does nothing if that was done, or if compiled code cannot be kept. Raises InputError if a part fails.
+    Does nothing if that was done, or if compiled code cannot be cached. Raises InputError if a part fails.
     """
     from cfplan.machine_code import cache_writable, code_folder, count_functions, delete_unused
 

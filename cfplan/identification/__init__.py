@@ -1,4 +1,4 @@
-"""Identification: what flights say about the vehicle and its latencies, each figure with its uncertainty."""
+"""Identification: estimate a vehicle's parameters and latencies from its flights, with their uncertainties."""
 
 __all__ = [
     "advice",

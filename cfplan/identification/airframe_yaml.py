@@ -20,7 +20,7 @@ _UNITS = {
     "drag": "N s/m, in the rotor plane and along the thrust axis",
     "rotor_reaction": "N m s/N",
     "velocity_moment": "N m per m/s, about x by velocity along y, and about -y by velocity along x",
-    "thrust_scale": "thrust given in hover per thrust asked for",
+    "thrust_scale": "actual over commanded thrust in hover",
     "thrust_curvature": "1 less the slope of thrust over its scale, in hover",
     "lift_with_speed": "1/(m/s)², gain of thrust",
     "voltage_sag": "1/V, fraction of thrust lost; 0 with battery compensation",
@@ -49,7 +49,7 @@ def airframe_text(airframe: Airframe) -> str:
 
 
 def safety_lines(found: Identification, file: Path) -> str:
-    """Return the lines of safety.yaml that make flights use what was found; none for poses that are dated right."""
+    """Return the lines of safety.yaml that make flights use what was found; none if poses are dated correctly."""
     pose = f"pose:\n  latency: {found.pose_latency:.4f}\n" if found.poses_misdated else ""
     return f"vehicle: {file.name}\n{pose}"
 
@@ -60,7 +60,7 @@ def check_target(file: Path, *, overwrite: bool = False) -> None:
 
 
 def write_airframe(airframe: Airframe, file: Path, *, overwrite: bool = False) -> None:
-    """Write the airframe's file, whole or not at all. Raises InputError where it exists or cannot be written."""
+    """Write the airframe's file atomically. Raises InputError where it exists or cannot be written."""
     check_target(file, overwrite=overwrite)
     write_atomically(file, airframe_text(airframe).encode())
 

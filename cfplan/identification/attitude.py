@@ -1,9 +1,9 @@
-"""Attitude: what the gyroscope says against the poses. It gives the poses' latency and how the markers are turned.
+"""Attitude: fit the gyroscope to the poses. The fit gives the poses' latency and the mounting of the markers.
 
 The gyroscope turns the vehicle's axes on the vehicle's clock, the poses those of the markers' body on motion capture's.
 Over short spans both turn by the same rotation vector, seen in axes that differ by the mounting M and at times that
-differ by the latency: φ_poses(t) = Mᵀ (φ_gyro(t − δ) − b T), with the gyroscope's bias b. Neither thrust nor drag nor a
-model of the vehicle is in it.
+differ by the latency: φ_poses(t) = Mᵀ (φ_gyro(t − δ) − b T), with the gyroscope's bias b. No thrust, drag or other
+model of the vehicle is involved.
 """
 
 from dataclasses import dataclass
@@ -31,9 +31,9 @@ _SMOOTHING = 0.25  # s, by which the slow difference of poses and gyroscope is s
 
 @dataclass(frozen=True, slots=True)
 class AttitudeFit:
-    """What the gyroscope and the poses say of each other; deviations are standard deviations."""
+    """The fit of the gyroscope to the poses; deviations are standard deviations."""
 
-    shift: float  # s by which poses are later than their dates say
+    shift: float  # s, delay of the poses behind their time stamps
     shift_deviation: float
     mounting: NDArray  # (3,) rad, rotation vector from the vehicle's axes to the markers' body's
     mounting_deviation: NDArray  # (3,) rad
@@ -76,7 +76,7 @@ def fit_attitude(signals: FlightSignals) -> AttitudeFit:
 
 
 def smooth_attitude(signals: FlightSignals, fit: AttitudeFit) -> Rotation:
-    """Return the attitude of the markers' body on the grid: quick turns by the gyroscope, slow ones by the poses."""
+    """Return the attitude of the markers' body on the grid: fast turns by the gyroscope, slow ones by the poses."""
     grid = grid_of(signals)
     rates = _rates(signals)(grid[:-1] + STEP / 2) - fit.gyro_bias
     turned = _integrate(Rotation.from_rotvec(fit.mounting).inv().apply(rates))
@@ -91,7 +91,7 @@ def smooth_attitude(signals: FlightSignals, fit: AttitudeFit) -> Rotation:
 
 
 def inverse_information(information: NDArray) -> NDArray:
-    """Return the inverse of an information matrix (N, N): large where nothing is known, in units that differ widely."""
+    """Return the inverse of an information matrix (N, N), large without information; units may differ widely."""
     size = np.sqrt(np.maximum(np.diag(information), _MIN_INFORMATION))
     scaled = information / np.outer(size, size) + _REGULARISATION * np.eye(len(size))
     return np.linalg.inv(scaled) / np.outer(size, size)
@@ -103,8 +103,8 @@ def _rates(signals: FlightSignals) -> CubicSpline:
 
 def _at(grid: NDArray, turned: NDArray, time: NDArray) -> Rotation:
     place = np.clip(((time - grid[0]) / STEP).astype(int), 0, len(grid) - 2)
-    share = ((time - grid[place]) / STEP)[:, None]
-    return Rotation.from_quat(turned[place] * (1 - share) + turned[place + 1] * share)
+    weight = ((time - grid[place]) / STEP)[:, None]
+    return Rotation.from_quat(turned[place] * (1 - weight) + turned[place + 1] * weight)
 
 
 @njit

@@ -31,7 +31,7 @@ LARGEST = 0.2  # m; a vehicle with a larger deviation does not match its airfram
 # s of hover after the end that count as flight, about as long as the pilot holds it. The shift at the end also applies
 # there, while a vehicle that lagged by 4 cm arrives within half a second and would be displaced by all of it.
 HOVER = 1.25
-_ENOUGH = 3  # flights needed to separate repeated deviation from chance
+_MIN_FLIGHTS = 3  # flights needed to separate repeated deviation from chance
 _CHANCE = 2.0  # times the variance expected by chance; a larger one repeats
 _FLOWN_HINT = "name records of flights that flew the whole plan and landed"
 
@@ -75,7 +75,7 @@ def learn_correction(flights: Sequence[EarlierFlight]) -> Learned:
     Raises InputError with the record where poses are missing, or the vehicle strayed by more than LARGEST.
     """
     duration, count = flights[0].planned.duration, len(flights)
-    seen = [_strayed(flight) for flight in flights]
+    seen = [_deviation(flight) for flight in flights]
     each = [fit_correction(one.time, one.off, duration, SPACING) for one in seen]
     mean = np.mean([one.coefficients for one in each], axis=0)
     correction, last = PlanCorrection(-mean, duration), seen[-1]
@@ -90,11 +90,11 @@ def learn_correction(flights: Sequence[EarlierFlight]) -> Learned:
         before=_largest(last.off + last.shift),
         expected=float(np.mean([_largest(one.off + correction.at(one.time)[:, 0]) for one in seen])),
         unrepeated=float(np.sqrt(variance)),
-        exhausted=bool(count >= _ENOUGH and left**2 <= _CHANCE * variance * count / (count - 1)),
+        exhausted=bool(count >= _MIN_FLIGHTS and left**2 <= _CHANCE * variance * count / (count - 1)),
     )
 
 
-class _Strayed(NamedTuple):
+class _Deviation(NamedTuple):
     """The deviation of a vehicle in one flight."""
 
     time: NDArray  # (N,) s, when the plan is where the vehicle was wanted
@@ -102,7 +102,7 @@ class _Strayed(NamedTuple):
     shift: NDArray  # (N, 3) m, of the commanded trajectory from the plan
 
 
-def _strayed(flight: EarlierFlight) -> _Strayed:
+def _deviation(flight: EarlierFlight) -> _Deviation:
     """Return the deviation of a flight. Raises InputError like learn_correction()."""
     end = flight.asked.duration + HOVER
     known = np.isfinite(flight.position).all(axis=1) & (flight.times >= 0.0) & (flight.times <= end)
@@ -124,7 +124,7 @@ def _strayed(flight: EarlierFlight) -> _Strayed:
             "corrected",
             where=flight.where, hint="fly flights/identify.yaml and `cfplan identify` its record, or fly slower",
         )  # fmt: skip
-    return _Strayed(flight.planned.time_at(s), off, asked - flight.planned.path(s))
+    return _Deviation(flight.planned.time_at(s), off, asked - flight.planned.path(s))
 
 
 def _largest(off: NDArray) -> float:
@@ -148,7 +148,7 @@ class EarlierFlights:
 def earlier_flights(folders: Sequence[Path], path_or_plan: Path, limits: Limits, *, on_board: bool) -> EarlierFlights:
     """Read records of flights of a path file or plan file under these limits, the last one last.
 
-    Raises InputError where a record is no whole flight, or airframe, limits, room or plan are others than today's.
+    Raises InputError where a record is not a complete flight, or airframe, limits, room or plan differ from today's.
     """
     read = [_read(Path(folder), limits, on_board) for folder in folders]
     record, file, plan = read[-1][:3]

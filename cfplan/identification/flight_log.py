@@ -20,7 +20,7 @@ FEWEST, SHORTEST = 200, 2.0  # records; s
 LONGEST_GAP = 0.5  # s without a record, beyond which a controller's integrals cannot be followed
 _GAP, _GAP_MARGIN = 0.03, 0.15  # s without a record that make a gap; s beside a gap that are left out
 _RATE = 90.0  # 1/s, least rate of records for recomputing the controller
-_FASTEST_TURN = np.radians(80.0)  # rad of tilt beyond which a vehicle has crashed
+_MAX_TILT = np.radians(80.0)  # rad of tilt beyond which a vehicle has crashed
 _COMMANDS = (("thrustSI", "thrustSi"), ("torquex",), ("torquey",), ("torquez",))  # of ctrlLee, by firmware
 
 
@@ -104,10 +104,10 @@ def check_log(log: FlightLog) -> None:
             hint="log fewer variables, or cut the log there: --from and --to take the part before or behind",
         )
     tilt = np.arccos(np.clip(log.attitude.as_matrix()[:, 2, 2], -1.0, 1.0))
-    if tilt.max() > _FASTEST_TURN:
-        at = log.time[np.argmax(tilt > _FASTEST_TURN)]
+    if tilt.max() > _MAX_TILT:
+        at = log.time[np.argmax(tilt > _MAX_TILT)]
         raise InputError(
-            f"the vehicle crashed: it tilted by more than {np.degrees(_FASTEST_TURN):.0f}° at {at:.2f} s",
+            f"the vehicle crashed: it tilted by more than {np.degrees(_MAX_TILT):.0f}° at {at:.2f} s",
             where=where,
             hint=f"take the part before: --to {max(at - 0.5, 0.0):.1f}",
         )

@@ -16,8 +16,8 @@ from cfplan.identification.signals import read_signals
 from cfplan.identification.translation import BATTERY, LINEAR, FittedUnknowns, FlightModel, flight_model, slow_voltage
 from cfplan.recording.record import Record
 
-_POSE_NOISE = 1e-3  # m, of which the misfit is counted in the search; the uncertainties take what is found
-_SHIFT_STD = 0.5e-3  # s, of the shift beyond what the gyroscope's noise says
+_POSE_NOISE = 1e-3  # m, unit of the misfit in the search; the uncertainties use the remaining misfit
+_SHIFT_STD = 0.5e-3  # s, of the shift, besides the effect of the gyroscope's noise
 _BATTERY_PRIOR = 0.1  # 1/V, standard deviation of the relative change of thrust: firmware makes up for the voltage
 _LAG_RANGE = (0.01, 0.3)  # s, between which the motor lag is sought
 _MAX_SHIFT = 0.1  # s, at most
@@ -27,7 +27,7 @@ _SCALE = np.array([0.05, 0.01, 0.005, 0.005])
 
 
 def identify(records: Sequence[Record], *, mass: float | None = None) -> Identification:
-    """Identify the vehicle that flew `records`; `mass`, kg, is what a scale says, the records' own where not given.
+    """Identify the vehicle that flew `records`; `mass`, kg, is its weighed mass, by default that in the records.
 
     Raises InputError where a record holds no flight, too little of it, or that of another vehicle.
     """
@@ -67,7 +67,7 @@ def _check_same_vehicle(records: Sequence[Record]) -> None:
 
 
 class _Problem:
-    """The misfit of all flights as a function of what it is not linear in: the lag, and three times a flight."""
+    """The misfit of all flights as a function of the nonlinear unknowns: the lag, and three times a flight."""
 
     def __init__(self, models: Sequence[FlightModel]):
         self.models = models
@@ -114,7 +114,7 @@ class _Problem:
         return self._differences(self.residual, unknown)
 
     def derivatives(self, unknown: NDArray, linear: NDArray) -> NDArray:
-        """Return how the prediction changes with each of the unknowns, the linear ones kept."""
+        """Return the derivative of the prediction by each of the unknowns, with the linear ones fixed."""
 
         def predicted(at: NDArray) -> NDArray:
             measured, columns, _ = self.equations(at)
@@ -123,7 +123,7 @@ class _Problem:
         return self._differences(predicted, unknown)
 
     def _differences(self, function: Callable[[NDArray], NDArray], unknown: NDArray) -> NDArray:
-        """Return the derivatives by steps of a millisecond or two: the command's stairs have corners below that."""
+        """Return derivatives by differences of a millisecond or two: below that the command has corners."""
         here, high, columns = function(unknown), self.bounds()[1], []
         for place in range(len(unknown)):
             step = _LAG_STEP if place == 0 else _TIME_STEP
@@ -133,7 +133,7 @@ class _Problem:
         return np.column_stack(columns)
 
     def information(self, unknown: NDArray) -> NDArray:
-        """Return what is known beforehand of the unknowns, as inverse variances."""
+        """Return the prior information on the unknowns, as inverse variances."""
         known = np.zeros(LINEAR + len(unknown))
         known[:LINEAR] = self._prior_stds() ** -2
         low, high = self.bounds()
@@ -143,7 +143,7 @@ class _Problem:
         return known
 
     def _prior_stds(self) -> NDArray:
-        """Return what is known of the linear unknowns beforehand, as standard deviations about zero."""
+        """Return prior standard deviations of the linear unknowns, about zero."""
         airframe = self.models[0].signals.airframe
         stds = np.full(LINEAR, np.inf)
         stds[BATTERY] = _BATTERY_PRIOR * airframe.motor_thrust_max / airframe.mass
@@ -180,9 +180,8 @@ def _covariance(
 ) -> NDArray:
     """Return the covariance of all unknowns.
 
-    What is left unexplained is no white noise: its correlation within a window is taken from the misfit itself, by
-    clusters (White 1980), as one factor for all unknowns, as there are few windows. What is known beforehand is added
-    as information.
+    The residual is not white noise: its correlation within a window is estimated from the misfit itself, by clusters
+    (White 1980), as one factor for all unknowns, as there are few windows. Priors are added as information.
     """
     jacobian = np.column_stack([columns, problem.derivatives(unknown, linear)])
     variance = float(np.mean(misfit**2))

@@ -21,16 +21,16 @@ _PERIOD = 0.002  # s, period of the grid on which columns are smoothed
 _SMOOTHING = 0.012  # s
 _CLIMB_SMOOTHING = 0.030  # s, before the climb is differentiated
 _LAGS = np.arange(0.025, 0.125, 0.005)  # s, of the motors
-_FASTEST = 0.35  # m/s in body axes, which a flight must reach to show moment and drag
+_MIN_SPEED = 0.35  # m/s in body axes, which a flight must reach to show moment and drag
 _LEAST_FIT = 0.85  # fraction of the torque's variance that moment and inertia must explain
 _INERTIAS, _MOMENTS = (0.5e-5, 6e-5), (0.0, 1.5e-3)  # kg m², N m per m/s: plausible for a Crazyflie
 _SCALES = (0.5, 2.0)  # of thrust
 _CURVATURES, _LIFTS = (-0.5, 0.5), (0.0, 0.02)  # of thrust; 1/(m/s)²
-_LEAST_THRUST_VARIED = 0.008  # of its mean
+_MIN_THRUST_VARIATION = 0.008  # of its mean
 _FEWEST_POSES = 50
-_MOST_OF_SUM = 0.999  # largest inertia about z, as a fraction of the sum of those about x and y
+_MAX_YAW_INERTIA = 0.999  # largest inertia about z, as a fraction of the sum of those about x and y
 _ROUNDS = 4  # iterations until the scale and the curvature of thrust agree
-_SLOW = 0.5  # s over which the battery's voltage is averaged
+_VOLTAGE_SMOOTHING = 0.5  # s over which the battery's voltage is averaged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,7 +88,7 @@ def scale_by_voltage(log: FlightLog, airframe: Airframe) -> NDArray:
     grid = np.arange(0.0, log.duration, 0.001)
     if log.voltage is None or airframe.voltage_sag == 0.0:
         return np.full(len(grid), airframe.thrust_scale)
-    slow = gaussian_filter1d(log.voltage, _SLOW / float(np.median(log.gaps)))
+    slow = gaussian_filter1d(log.voltage, _VOLTAGE_SMOOTHING / float(np.median(log.gaps)))
     hover = float(slow[log.time <= HOVER].mean())
     return airframe.thrust_scale * (1.0 + airframe.voltage_sag * (np.interp(grid, log.time, slow) - hover))
 
@@ -102,7 +102,7 @@ def measure(log: FlightLog, airframe: Airframe) -> Measured:
     for by in (_by_torque, _by_accelerometer, _by_thrust):
         known = by(columns, known, found, unknown)
     known = replace(known, thrust_scale=thrust_scale(log, known))
-    found["thrust scale"] = f"{known.thrust_scale:.3f} of what is asked for, in the first {HOVER:g} s"
+    found["thrust scale"] = f"{known.thrust_scale:.3f} of the commanded thrust, in the first {HOVER:g} s"
     return Measured(known, found, tuple(unknown), tuple(unlike(known, airframe)), _errors_of_estimate(log))
 
 
@@ -139,7 +139,7 @@ def pooled(flights: Sequence[Measured], airframe: Airframe) -> Airframe:
     return replace(
         airframe,
         velocity_moment=moment,
-        inertia=(*inertia, min(airframe.inertia[2], _MOST_OF_SUM * sum(inertia))),
+        inertia=(*inertia, min(airframe.inertia[2], _MAX_YAW_INERTIA * sum(inertia))),
         drag=(drag, airframe.drag[1]),
         motor_time_constant=median("motor lag", lambda each: each.motor_time_constant),
         lift_with_speed=median("lift with speed", lambda each: each.lift_with_speed),
@@ -199,9 +199,9 @@ def _by_torque(columns: _Smooth, known: Airframe, found: dict[str, str], unknown
     moment, inertia = list(known.velocity_moment), list(known.inertia)
     fits = {lag: [_torque_fit(columns, turning, known, axis, float(lag)) for axis in (0, 1)] for lag in _LAGS}
     moved = [float(np.abs(columns.velocity[columns.keep, 1 - axis]).max()) for axis in (0, 1)]
-    axes = [axis for axis in (0, 1) if moved[axis] > _FASTEST]
+    axes = [axis for axis in (0, 1) if moved[axis] > _MIN_SPEED]
     if not axes:
-        unknown.append(f"moment, inertia and motor lag: the flight is slower than {_FASTEST:g} m/s")
+        unknown.append(f"moment, inertia and motor lag: the flight is slower than {_MIN_SPEED:g} m/s")
         return known
     lag = float(max(fits, key=lambda each: sum(fits[each][axis][2] for axis in axes)))
     for axis, name in enumerate(("roll", "pitch")):
@@ -214,7 +214,7 @@ def _by_torque(columns: _Smooth, known: Airframe, found: dict[str, str], unknown
         else:
             unknown.append(f"{name} moment: {'flown too slowly' if axis not in axes else 'the torque is another'}")
     found["motor lag"] = f"{1e3 * lag:.0f} ms"
-    yaw = min(inertia[2], _MOST_OF_SUM * (inertia[0] + inertia[1]))
+    yaw = min(inertia[2], _MAX_YAW_INERTIA * (inertia[0] + inertia[1]))
     return replace(
         known, velocity_moment=(moment[0], moment[1]), inertia=(inertia[0], inertia[1], yaw), motor_time_constant=lag
     )
@@ -246,11 +246,11 @@ def _by_accelerometer(columns: _Smooth, known: Airframe, found: dict[str, str], 
     slopes = []
     for axis in (0, 1):
         speed = columns.velocity[columns.keep, axis]
-        if np.abs(speed).max() > _FASTEST:
+        if np.abs(speed).max() > _MIN_SPEED:
             design = np.column_stack([-speed, np.ones(len(speed))])
             slopes.append(float(np.linalg.lstsq(design, columns.force[columns.keep, axis], rcond=None)[0][0]))
     if not slopes:
-        unknown.append(f"drag: the flight is slower than {_FASTEST:g} m/s")
+        unknown.append(f"drag: the flight is slower than {_MIN_SPEED:g} m/s")
         return known
     drag = float(np.mean(slopes))
     found["drag"] = f"{drag:.2f} 1/s of the mass"
@@ -263,7 +263,7 @@ def _by_thrust(columns: _Smooth, known: Airframe, found: dict[str, str], unknown
     thrust = _lagged(columns.thrust, known.motor_time_constant)[keep]
     given = known.mass * columns.along[keep] + known.drag[1] * columns.velocity[keep, 2]
     squared = (columns.velocity[keep, :2] ** 2).sum(axis=1)
-    if np.std(thrust) < _LEAST_THRUST_VARIED * thrust.mean():
+    if np.std(thrust) < _MIN_THRUST_VARIATION * thrust.mean():
         unknown.append("lift with speed, curvature of thrust: the thrust hardly changes")
         return known
     design = np.column_stack([np.ones(len(thrust)), thrust / thrust.mean() - 1.0, squared])

@@ -1,4 +1,4 @@
-"""Identified quantities with units and uncertainties, and what the records cannot determine."""
+"""Identified quantities with units and uncertainties, and the quantities that the records cannot determine."""
 
 import math
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ _LOG_DELAY, _LOG_DELAY_STD = 2e-3, 1e-3
 _PLAUSIBLE_RATIO = (0.5, 2.0)  # plausible range of thrust over mass, relative to the airframe
 _SIGNIFICANT_DEVIATIONS = 2.0  # standard uncertainties
 _LARGE_MISFIT = 0.004  # m rms
-_MAX_DRAG_STD, _MAX_LAG_STD = 0.3, 0.02  # share of the value, s: larger uncertainties count as unobservable
+_MAX_DRAG_STD, _MAX_LAG_STD = 0.3, 0.02  # fraction of the value, s: larger uncertainties count as unobservable
 _MIN_VOLTAGE_SPAN = 0.3  # V, least range of the voltage
 
 

@@ -11,19 +11,19 @@ from cfplan.recording.record import Estimates, Poses, Record, Setpoints, StatusR
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.motor_commands import command_shares
 
-SHORTEST = 5.0  # s of flight that say anything
+SHORTEST = 5.0  # s, least duration of a usable flight
 _BEGINS = (Phase.GO_TO_START, Phase.STREAM)
 _ENDS = (Phase.LAND, Phase.DISARM, Phase.CLOSED)
-_LARGEST_GAPS = {"poses": 0.1, "estimates": 0.1, "status": 0.2}  # s, median interval; sparser streams say too little
+_LARGEST_GAPS = {"poses": 0.1, "estimates": 0.1, "status": 0.2}  # s, median interval; sparser streams are rejected
 _UNIT = 0.1  # by which the length of a quaternion may differ from 1
-_ON_TIME = 5  # percentile of the poses' arrivals: those that nothing delayed
+_UNDELAYED_PERCENTILE = 5  # of the poses' delays: the delay of poses that nothing held back
 
 _Stream = Setpoints | Poses | Estimates | StatusReports
 
 
 @dataclass(frozen=True, slots=True)
 class FlightSignals:
-    """One flight; times are s from its beginning, on the clock of the vehicle's messages as the pilot dates them."""
+    """One flight; times are s from its beginning, on the clock of the vehicle's messages as dated by the pilot."""
 
     airframe: Airframe  # as the pilot set the controller
     duration: float  # s
@@ -33,10 +33,10 @@ class FlightSignals:
     quaternion: NDArray  # (N, 4) body→world x y z w, of the markers' body
     status_time: NDArray  # (M,) s
     gyro: NDArray  # (M, 3) rad/s
-    command: NDArray  # (M, 4) share of the full command of each motor
+    command: NDArray  # (M, 4) fraction of the full command of each motor
     voltage: NDArray  # (M,) V
     estimate_time: NDArray  # (K,) s
-    estimate: NDArray  # (K, 10) position, velocity, quaternion as the controller believes
+    estimate: NDArray  # (K, 10) position, velocity, quaternion as estimated on board
     sent_time: NDArray  # (L,) s
     setpoint: NDArray  # (L, 9) position, velocity, acceleration
     begin: float = 0.0  # s, of the record's clock, at which these times are 0
@@ -69,7 +69,7 @@ def read_signals(record: Record) -> FlightSignals:
     return FlightSignals(
         airframe=record.header.vehicle,
         duration=end - begin,
-        behind=float(np.percentile(poses["received"] - poses["time"], _ON_TIME)),
+        behind=float(np.percentile(poses["received"] - poses["time"], _UNDELAYED_PERCENTILE)),
         pose_time=poses["time"] - begin,
         position=poses["position"],
         quaternion=poses["quaternion"],
@@ -86,7 +86,7 @@ def read_signals(record: Record) -> FlightSignals:
 
 
 def _airborne(record: Record, where: str) -> tuple[float, float]:
-    """Return from when to when, s, the pilot streamed setpoints in the air."""
+    """Return begin and end, s, of the streaming of setpoints in the air."""
     phases = [str(phase) for phase in record.phases.phase]
     begins = [time for time, phase in zip(record.phases.time, phases, strict=True) if phase in _BEGINS]
     if not begins:

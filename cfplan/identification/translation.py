@@ -7,8 +7,8 @@ In the axes of the markers' body, R from them to the world, F the collective com
 L is the airframe's lift with speed; κ (3,) is the thrust of the full command over the mass, along the thrust axis; D =
 diag(d, d, d_z) the drag over the mass; r the markers' origin. Integrated twice over windows whose position and velocity
 at the start are free, this is linear in κ, d, d_z, r and in the change of κ with the battery's voltage; the motors'
-lag, δ and the two moments of the command's stairs are not linear. Masses, thrusts, drag and inertia scaled by one
-factor move alike: no record of motion tells that factor.
+lag, δ and the two times of the command's steps enter nonlinearly. If masses, thrusts, drag and inertia are scaled by
+one factor, the motion is the same: no record of motion determines that factor.
 """
 
 from dataclasses import dataclass, field
@@ -27,9 +27,9 @@ WINDOW = 1.0  # s over which motion is predicted from a free start
 # Columns of the linear unknowns: thrust along the markers' axes, drag, origin, change of thrust with voltage.
 THRUST, DRAG, AXIAL_DRAG, ORIGIN, BATTERY = slice(0, 3), 3, 4, slice(5, 8), 8
 LINEAR = 9
-_FEWEST = 0.6  # share of a window's poses that must be there
+_MIN_COVERAGE = 0.6  # fraction of a window's poses that must be present
 _LONGEST_GAP = 0.06  # s without a pose or a status, in a window that counts
-_SLOW = 2.0  # s over which the voltage is averaged: its sag under load is no state of charge
+_VOLTAGE_SMOOTHING = 2.0  # s over which the voltage is averaged: sag under load does not reflect the state of charge
 _VELOCITY_WINDOW = 15  # poses through which a cubic is drawn for the velocity that drag acts on
 
 
@@ -73,7 +73,7 @@ class FlightModel:
         )
 
     def _command(self, delay: float, phase: float) -> NDArray:
-        """Return the collective command; a fit asks for few different ones again and again."""
+        """Return the collective command; cached, as a fit requests few different ones many times."""
         key = (delay, phase)
         if key not in self._cache:
             if len(self._cache) > 50:
@@ -95,11 +95,11 @@ class FittedUnknowns:
     lag: float  # s
     times: NDArray  # (R, 3) s, each record's shift of poses, delay of setpoints, phase of predictions
     covariance: NDArray  # of linear, lag, and the times of each record
-    rms: float  # m, of what the model leaves unexplained
+    rms: float  # m, of the residual
 
 
 def flight_model(signals: FlightSignals, reference_voltage: float) -> FlightModel:
-    """Return the model of a flight; `reference_voltage`, V, is where the thrust is told."""
+    """Return the model of a flight; `reference_voltage`, V, is the voltage of the stated thrust."""
     attitude = fit_attitude(signals)
     turn = smooth_attitude(signals, attitude)
     return FlightModel(
@@ -114,7 +114,7 @@ def flight_model(signals: FlightSignals, reference_voltage: float) -> FlightMode
 
 def slow_voltage(signals: FlightSignals) -> NDArray:
     """Return the voltage (M,), V, averaged over seconds."""
-    count = max(1, round(_SLOW / float(np.median(np.diff(signals.status_time)))))
+    count = max(1, round(_VOLTAGE_SMOOTHING / float(np.median(np.diff(signals.status_time)))))
     return uniform_filter1d(signals.voltage, count, mode="nearest")
 
 
@@ -135,7 +135,7 @@ def _windows(signals: FlightSignals) -> list[NDArray]:
         rows = np.flatnonzero((signals.pose_time >= begin) & (signals.pose_time < begin + WINDOW))
         edges = (begin, begin + WINDOW)
         streams = (signals.pose_time[rows], signals.status_time, signals.sent_time, signals.estimate_time)
-        if len(rows) >= _FEWEST * expected and max(_gap(times, *edges) for times in streams) < _LONGEST_GAP:
+        if len(rows) >= _MIN_COVERAGE * expected and max(_gap(times, *edges) for times in streams) < _LONGEST_GAP:
             found.append(rows)
     return found
 

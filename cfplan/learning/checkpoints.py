@@ -23,7 +23,7 @@ class Epoch:
     epoch: int
     loss: float
     unseen_loss: float
-    time_error: float  # mean relative error of travel time on unseen paths, planned whole
+    time_error: float  # mean relative error of travel time on complete unseen paths
     time_error_mean: float  # of the absolute errors
     time_error_p95: float
     rate: float
@@ -33,7 +33,7 @@ class Epoch:
 def save_checkpoint(
     folder: Path, identity: dict[str, Any], network: nn.Module, optimiser: optim.Optimizer, log: list[Epoch]
 ) -> None:
-    """Write all that resuming needs, and the log as a table; each file whole or not at all."""
+    """Write everything that resuming needs, and the log as a table; each file atomically."""
     content = {
         "identity": identity,
         "network": network.state_dict(),
@@ -57,10 +57,10 @@ def resume(
 ) -> list[Epoch]:
     """Load the folder's checkpoint into network and optimiser, if there is one; return its log.
 
-    The number of epochs may be another: the learning rate then falls towards the new end.
+    The number of epochs may differ: the learning rate then falls towards the new end.
 
     Raises:
-        InputError: a damaged checkpoint, or that of another training.
+        InputError: a damaged checkpoint, or one of a different training.
     """
     file = folder / CHECKPOINT
     if not file.exists():

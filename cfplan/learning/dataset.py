@@ -1,7 +1,7 @@
 """Datasets on disk: made shard by shard by any number of workers, resumed where they stopped, read and summarised.
 
-A folder holds dataset.json, shards/NNNNN.parquet (the rows), and timing/NNNNN.parquet (how long each solve took, which
-no two runs repeat, and which is therefore kept apart from the rows that every run repeats to the byte).
+A folder holds dataset.json, shards/NNNNN.parquet (the rows), and timing/NNNNN.parquet (solve times, which differ from
+run to run and are therefore kept apart from the rows, which every run reproduces byte for byte).
 """
 
 import io
@@ -47,7 +47,7 @@ def make_dataset(
     """Make the missing shards of a dataset. `on_rows` is called with the number of rows that were added on disk.
 
     `choose` chooses paths through waypoints, for a spec that asks for chosen ones.
-    Stopped at any moment, it loses the shards under way and no more; the next call makes those.
+    If it is stopped, only unfinished shards are lost; the next call makes them.
     Raises InputError where the folder holds another dataset or cannot be written, SchedulerError where the scheduler
     does not answer within ten seconds.
     """
@@ -77,7 +77,7 @@ def read_dataset(folder: Path) -> tuple[DatasetSpec, pa.Table]:
 
 
 def read_timing(folder: Path) -> pa.Table:
-    """Read how long the solve of each existing row took."""
+    """Read the solve time of each existing row."""
     load_spec(folder)
     return _read(folder, TIMING, TIMING_SCHEMA)
 
@@ -87,7 +87,7 @@ def describe(folder: Path) -> dict[str, Any]:
     spec, rows = read_dataset(folder)
     timing = read_timing(folder)
     solved = rows.filter(pa.compute.equal(rows["status"], Status.SOLVED.name))
-    share = _numbers(solved, "certified_share")
+    factor = _numbers(solved, "certified_share")
     values = {name: _numbers(solved, name) for name in ("length", "travel_time", "peak_speed", "iterations")}
     with np.errstate(all="ignore"):  # damaged rows
         values["mean_speed"] = values["length"] / values["travel_time"]
@@ -100,9 +100,9 @@ def describe(folder: Path) -> dict[str, Any]:
         "rows_wanted": spec.rows,
         "solved": solved.num_rows,
         "failed": dict(Counter(status for status in rows["status"].to_pylist() if status != Status.SOLVED.name)),
-        "certified_as_they_are": int(np.sum(share >= 1.0)),
-        "certified_when_slowed": int(np.sum((share > 0.0) & (share < 1.0))),
-        "never_certified": int(np.sum(share <= 0.0)),
+        "certified_as_they_are": int(np.sum(factor >= 1.0)),
+        "certified_when_slowed": int(np.sum((factor > 0.0) & (factor < 1.0))),
+        "never_certified": int(np.sum(factor <= 0.0)),
         "percentiles": {name: _percentiles(values[name]) for name in DISTRIBUTIONS},
         "active_limits": {name: count / max(1, solved.num_rows) for name, count in active.most_common()},
     }

@@ -1,4 +1,4 @@
-"""DatasetSpec: everything that decides the rows of a dataset, kept beside them as dataset.json.
+"""DatasetSpec: everything that determines the rows of a dataset, kept beside them as dataset.json.
 
 A path's perturbed copies with the clean path's label are the paper's noise injection.
 """
@@ -19,9 +19,9 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import Airframe
 
 SPEC_FILE = "dataset.json"
-DRAWN, GIVEN = "drawn", "given"  # limits that are no set by name
-_MOST = 10_000_000  # paths, copies of one, rows of a shard
-_MOST_WAYPOINTS, _MOST_NODES = 1000, 100_000
+DRAWN, GIVEN = "drawn", "given"  # limits that are not a named set
+_MAX_COUNT = 10_000_000  # paths, copies of one, rows of a shard
+_MAX_WAYPOINTS, _MAX_NODES = 1000, 100_000
 _SINCE = {"planner", "shape"}  # keys that datasets of older versions lack
 _REMEDY = "give another folder, or make the dataset again"
 
@@ -42,7 +42,7 @@ class Labeller(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetSpec:
-    """Two datasets with equal specs have equal rows, whoever makes them and with however many workers."""
+    """The specification of a dataset: equal specs give equal rows, with any number of workers."""
 
     count: int  # clean paths
     seed: int
@@ -50,7 +50,7 @@ class DatasetSpec:
     """A limit set by name; `drawn`: limits and vehicle are drawn for each path; `given`: `airframe` and `plan`."""
     airframe: Airframe | None = None
     plan: PlanLimits | None = None
-    families: tuple[Family, ...] = USUAL  # that paths take in turn; with boxes, none
+    families: tuple[Family, ...] = USUAL  # of the paths, in turn; empty with boxes
     boxes: tuple[tuple[float, float, float], ...] = ()
     """Sides, m, of where waypoints are drawn; paths take the boxes in turn, instead of families."""
     waypoints: tuple[int, int] = (3, 6)  # least and most
@@ -67,18 +67,22 @@ class DatasetSpec:
     def __post_init__(self) -> None:
         low, high = self.waypoints
         wrong = [
-            ("count", not 1 <= self.count <= _MOST, f"from 1 to {_MOST}"),
+            ("count", not 1 <= self.count <= _MAX_COUNT, f"from 1 to {_MAX_COUNT}"),
             ("seed", self.seed < 0, "at least 0"),
             ("limits", self.limits not in (*DATA_SETS, DRAWN, GIVEN), f"one of {', '.join((*DATA_SETS, DRAWN))}"),
-            ("plan", (self.limits == GIVEN) != (None not in (self.plan, self.airframe)), "there with given limits"),
+            (
+                "plan",
+                (self.limits == GIVEN) != (None not in (self.plan, self.airframe)),
+                "set exactly with given limits",
+            ),
             ("boxes", not all(_is_box(box) for box in self.boxes), "of three lengths in m each"),
-            ("families", bool(self.families) == bool(self.boxes), "there unless boxes are"),
-            ("waypoints", not 2 <= low <= high <= _MOST_WAYPOINTS, f"2 to {_MOST_WAYPOINTS}, least first"),
-            ("nodes", not 4 <= self.nodes <= _MOST_NODES, f"from 4 to {_MOST_NODES}"),
-            ("copies", not 0 <= self.copies <= _MOST, f"from 0 to {_MOST}"),
+            ("families", bool(self.families) == bool(self.boxes), "empty exactly if boxes are set"),
+            ("waypoints", not 2 <= low <= high <= _MAX_WAYPOINTS, f"2 to {_MAX_WAYPOINTS}, least first"),
+            ("nodes", not 4 <= self.nodes <= _MAX_NODES, f"from 4 to {_MAX_NODES}"),
+            ("copies", not 0 <= self.copies <= _MAX_COUNT, f"from 0 to {_MAX_COUNT}"),
             ("epsilon", not 0 <= self.epsilon < float("inf"), "at least 0"),
             ("epsilon", (self.epsilon > 0) != (self.copies > 0), "given together with copies"),
-            ("shard_rows", not 1 <= self.shard_rows <= _MOST, f"from 1 to {_MOST}"),
+            ("shard_rows", not 1 <= self.shard_rows <= _MAX_COUNT, f"from 1 to {_MAX_COUNT}"),
         ]
         for name, is_wrong, allowed in wrong:
             if is_wrong:
@@ -110,7 +114,7 @@ class DatasetSpec:
         return range(number * self.shard_rows, min(self.rows, (number + 1) * self.shard_rows))
 
     def save(self, folder: Path) -> None:
-        """Write dataset.json, whole or not at all."""
+        """Write dataset.json atomically."""
         with atomic_write(folder / SPEC_FILE) as unfinished:
             unfinished.write_text(json.dumps(asdict(self), indent=2) + "\n")
 
@@ -121,7 +125,7 @@ def _is_box(sides: tuple[float, ...]) -> bool:
 
 def load_spec(folder: Path) -> DatasetSpec:
     """Read the spec of a dataset folder. Raises InputError where there is none or it cannot be read."""
-    from pydantic import TypeAdapter  # takes its time to import
+    from pydantic import TypeAdapter  # slow to import
 
     file = folder / SPEC_FILE
     if not file.is_file():

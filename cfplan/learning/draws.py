@@ -1,4 +1,4 @@
-"""Draws of vehicles and limits: what people fly, at random, each from a seed.
+"""Draw random vehicles and limits in the range that people fly, each from a seed.
 
 A quarter of the vehicles are the known ones, a quarter are these with a load, and half are made up: their inertia is
 that of a body of about their size, their motors lift 1.4 to 4 times their weight. Limits are drawn independently of
@@ -22,15 +22,15 @@ SPEED = (0.3, 8.0)  # m/s
 ACCELERATION = (1.0, 20.0)  # m/s²
 ANGULAR_VELOCITY = (2.0, 25.0)  # rad/s
 ANGULAR_ACCELERATION = (10.0, 300.0)  # rad/s²
-UNLIMITED_TURNING = 0.15  # share of the draws without a limit on angular acceleration
+UNLIMITED_TURNING = 0.15  # fraction of the draws without a limit on angular acceleration
 TILT = (15.0, 85.0)  # degrees
 RESERVE = (0.0, 0.4)  # of each motor's range
 SPECIFIC_THRUST = (0.1, 0.8)  # g
 MASS = (0.020, 0.080)  # kg
 LOAD = (0.95, 1.25)  # times a known vehicle's mass
 THRUST_TO_WEIGHT = (1.4, 4.0)
-KNOWN, LOADED = 0.25, 0.25  # shares of vehicles
-EDITED, EDIT = 0.25, 0.2  # share of limits that are edited ones, and by how much, as the spread of the logarithm
+KNOWN, LOADED = 0.25, 0.25  # fractions of the vehicles
+EDITED, EDIT = 0.25, 0.2  # fraction of the limits that are edited; spread of the logarithm of an edit
 WALLS = (0.1, 3.0)  # m, between the waypoints and each wall of a room
 HOVER_ROOM = 0.1  # of the thrust in hover: left between it and the limits of motor thrust at least
 

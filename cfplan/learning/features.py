@@ -1,4 +1,4 @@
-"""Features: the inputs of the networks, and how their output becomes h and yaw; the same in training and in flight.
+"""Features: the inputs of the networks and the meaning of their outputs; the same in training and in flight.
 
 Lengths are measured in v²/g and times in v/g, with v the limit on speed and g gravity. In these units limits and
 vehicle are a dozen numbers without dimension, `ScaledLimits`: one network knows all of them, as a dozen of its inputs.
@@ -34,22 +34,22 @@ TINY = 1e-9  # in units of length, least size of a derivative per step
 LEAST_SHARE = 0.1  # of h, least coefficient where h bends sharply within a step
 SMOOTHING = 0.41  # over the root of the angular acceleration: the time over which answers are smoothed
 
-# The numbers without dimension, by name, as model cards have them: what limits and vehicle are to a network.
+# The dimensionless numbers by name, as in model cards; they describe limits and vehicle to a network.
 NUMBERS = (
-    "acceleration",  # over g; like all up to here and the authorities as a logarithm
+    "acceleration",  # over g; a logarithm, as are the following seven
     "angular velocity",  # times v/g
-    "angular acceleration",  # times v²/g², or twice what motors give where it is more
-    "thrust upwards",  # the most over weight, less 1
-    "thrust downwards",  # 1 less the least over weight
+    "angular acceleration",  # times v²/g²; at most twice what motors give
+    "thrust upwards",  # largest over weight, less 1
+    "thrust downwards",  # 1 less the smallest over weight
     "roll authority",  # angular acceleration that motors give about each axis, times v²/g²
     "pitch authority",
     "yaw authority",
-    "specific thrust",  # the least, over g
+    "specific thrust",  # smallest, over g
     "tilt",  # rad
     "drag across",  # along body x and y, times v over the weight
     "drag along",  # along the thrust
 )
-LOGARITHMS = 8  # of them are logarithms
+LOGARITHMS = 8  # number of them that are logarithms
 BOUNDS = 6  # speed, acceleration, jerk, snap, yaw rate, yaw acceleration
 
 # Columns of a node table: g, g', g'', g''', the reference rate, how far above it each limit's own bound is, and yaw's
@@ -137,7 +137,7 @@ def rests(path: Path, s: float) -> bool:
 
 
 def node_features(path: Path, nodes: int, known: ScaledLimits, track: YawSpline | None) -> NDArray:
-    """Return (nodes+1, COLUMNS): the features of a grid of so many intervals; yaw is the track's where it is given."""
+    """Return (nodes+1, COLUMNS): the features of a grid of `nodes` intervals; yaw is the track's where it is given."""
     table, step = np.empty((nodes + 1, COLUMNS)), path.end / nodes
     turns = np.zeros((nodes + 1, 2))
     if track is not None:

@@ -1,7 +1,7 @@
 """Evaluate the networks without torch: one thread, compiled loops over weights laid out for them.
 
-Matrix products are loops of our own: numpy would hand them to threads, which wait for one another where the processor's
-other cores are busy.
+Matrix products are compiled loops: numpy would distribute them over threads, which wait for one another if the
+processor's other cores are busy.
 """
 
 from collections.abc import Mapping

@@ -31,10 +31,10 @@ from cfplan.vehicle.airframe import UNPLANNED, Airframe
 from cfplan.vehicle.trajectory import Trajectory
 
 _LIMITS, _SHAPE = 1, 2  # streams of random numbers: of limits, vehicles and yaw; of the path's shape and its room
-ACTIVE_SHARE = 0.98  # of a limit, from which it counts as active
+ACTIVE_USAGE = 0.98  # of a limit, from which it counts as active
 
 ChoosePath = Callable[[NDArray, Space, LimitSet, YawMode, float], Path]
-"""From waypoints, (K, 3) m, their room, vehicle and limits, and yaw with its angle, rad, to the path to be flown."""
+"""Return the path to be flown from waypoints, (K, 3) m, their room, vehicle and limits, and yaw with its angle, rad."""
 
 _TYPES = {float: pa.float64(), str: pa.string()}
 _NUMBERS = pa.list_(pa.float64())  # of all other fields of airframes and limits
@@ -75,7 +75,7 @@ SCHEMA = pa.schema(
         ("iterations", pa.int32()),
         ("travel_time", pa.float64()),  # s, before slowing
         ("peak_speed", pa.float64()),  # m/s
-        ("certified_share", pa.float64()),  # of its speed at which the dense certificate passes; 1 as it stands
+        ("certified_share", pa.float64()),  # fraction of its speed that the certificate passes; 1 without slowing
         ("active_limits", pa.list_(pa.string())),
     ]
 )
@@ -83,9 +83,9 @@ TIMING_SCHEMA = pa.schema([("row", pa.int64()), ("solve_seconds", pa.float64())]
 
 
 def make_rows(spec: DatasetSpec, rows: range, choose: ChoosePath | None = None) -> tuple[pa.Table, pa.Table]:
-    """Label these rows. Return their table, and a second one of solve times, which are measured and not computed.
+    """Label these rows. Return their table, and a second one of solve times, which differ from run to run.
 
-    Only `spec` and its number decide a row, so that any worker makes the same. Chosen paths need `choose`.
+    A row depends only on `spec` and its number, so every worker makes the same. Chosen paths need `choose`.
     """
     labelled = [_row(spec, row, choose) for row in rows]
     table = pa.Table.from_pylist([row for row, _ in labelled], schema=SCHEMA)
@@ -173,7 +173,7 @@ def solve(spec: DatasetSpec, number: int, path: Path) -> Solution:
     chosen, mode, angle = row_limits(spec, number)
     task = PlanningTask(path, chosen.airframe, chosen.limits, nodes=spec.nodes, yaw=mode, yaw_angle=angle)
     if spec.planner is Labeller.TOPPQUAD:
-        from cfplan.planners.baselines.toppquad import plan_toppquad  # with CasADi, which takes its time to import
+        from cfplan.planners.baselines.toppquad import plan_toppquad  # imports CasADi, which is slow
 
         return plan_toppquad(task)
     return plan_expert(task)
@@ -202,7 +202,7 @@ def _label(path: Path, solution: Solution, chosen: LimitSet) -> dict[str, Any]:
         "travel_time": trajectory.duration,
         "peak_speed": certificate.margins[0].worst,
         "certified_share": 1.0 if certificate.passed else _certified_speed_factor(trajectory, chosen.limits),
-        "active_limits": [margin.name for margin in certificate.margins if margin.share >= ACTIVE_SHARE],
+        "active_limits": [margin.name for margin in certificate.margins if margin.share >= ACTIVE_USAGE],
     }
 
 

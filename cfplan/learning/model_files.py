@@ -1,8 +1,8 @@
 """Model folders: weights.safetensors, and card.json with its provenance and what it may be used for.
 
-A card names its weights by their hash, and all that decides whether they may be used: the window, the version of the
-features, and the ranges of limits and vehicles that were learned from. Outside of those a model may propose badly, and
-the plan says so; what flies is certified either way.
+A card holds the hash of its weights and all that decides whether they may be used: the window, the version of the
+features, and the ranges of limits and vehicles in training. Outside of these a model may propose poorly, and the plan
+reports so; every flight is certified either way.
 """
 
 import hashlib
@@ -28,17 +28,17 @@ from cfplan.vehicle.airframe import Airframe
 
 WEIGHTS, CARD = "weights.safetensors", "card.json"
 FORMAT = 2
-LARGEST = 10_000  # layers, hidden numbers of each, and intervals of a window
-HEAVIEST = 1e6  # weight; trained ones are a few
-WIDEST = 100.0  # either end of a range; most are logarithms
-FURTHEST = 4.0  # beyond a range, in its own widths, that counts: what is further away is as bad
+MAX_SIZE = 10_000  # layers, hidden numbers of each, and intervals of a window
+MAX_WEIGHT = 1e6  # trained ones are a few
+MAX_RANGE_END = 100.0  # either end of a range; most are logarithms
+MAX_DISTANCE = 4.0  # from a range, in its own widths, beyond which models count as equally bad
 _RETRAIN = "train it again with `cfplan train`"
 _RESTORE = "restore both files from where the model came, or train it again with `cfplan train`"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Card:
-    """The provenance of a model, what it is for, and its scores."""
+    """The provenance of a model, its purpose, and its scores."""
 
     name: str
     architecture: str  # an Architecture
@@ -47,10 +47,10 @@ class Card:
     window: int  # intervals
     features: int  # version of features.py
     weights_sha256: str
-    ranges: dict[str, tuple[float, float]]  # of features.NUMBERS that were learned from
-    data: dict[str, Any]  # the dataset's spec, and how many of its rows were learned from
+    ranges: dict[str, tuple[float, float]]  # of features.NUMBERS in training
+    data: dict[str, Any]  # the dataset's spec, and the number of its rows used in training
     training: dict[str, Any]  # the command and its options
-    scores: dict[str, float]  # on paths that were not learned from
+    scores: dict[str, float]  # on paths held out from training
     date: str
     version: str  # of cfplan
     format: int = FORMAT
@@ -73,7 +73,7 @@ class Model:
         return self.card.window
 
     def outside(self, airframe: Airframe, limits: PlanLimits) -> tuple[str, ...]:
-        """Return how vehicle and limits lie outside of what the model has learned from, a sentence each."""
+        """Return a sentence for each number of vehicle and limits that lies outside of the model's training range."""
         known = scaled_limits(airframe, limits)
         sentences = []
         for k, (name, (low, high)) in enumerate(self.card.ranges.items()):
@@ -89,7 +89,7 @@ class Model:
 
 
 def save_model(folder: Path, card: Card, weights: Mapping[str, NDArray]) -> Card:
-    """Write both files, each whole or not at all. Return the card as written, with the hash of the weights."""
+    """Write both files atomically. Return the card as written, with the hash of the weights."""
     from safetensors.numpy import save
 
     content = save({name: np.ascontiguousarray(values) for name, values in weights.items()})
@@ -108,7 +108,7 @@ def load_card(folder: Path) -> Card:
         InputError: no card, one that cannot be read, or of another format or version of the features.
     """
     file = folder / CARD
-    if not file.is_file():  # a pipe would be waited for
+    if not file.is_file():  # opening a pipe would block
         raise InputError(f"no model: {CARD} is missing", where=str(folder), hint="train one with `cfplan train`")
     try:
         text = json.loads(file.read_bytes())
@@ -170,8 +170,8 @@ def load_weights(folder: Path) -> tuple[Card, dict[str, NDArray]]:
             where=where,
             hint=_RESTORE,
         )
-    if not all(values.dtype == np.float32 and (np.abs(values) < HEAVIEST).all() for values in weights.values()):
-        raise InputError(f"some weights are not finite 32-bit numbers below {HEAVIEST:g}", where=where, hint=_RESTORE)
+    if not all(values.dtype == np.float32 and (np.abs(values) < MAX_WEIGHT).all() for values in weights.values()):
+        raise InputError(f"some weights are not finite 32-bit numbers below {MAX_WEIGHT:g}", where=where, hint=_RESTORE)
     return card, weights
 
 
@@ -182,11 +182,11 @@ def models_folder() -> Path:
 
 
 def find_model(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...] = ()) -> Model | None:
-    """Load the model that knows this vehicle and these limits best.
+    """Load the model whose training ranges suit this vehicle and these limits best.
 
-    `folders` are folders of models, or that of a model, which is then taken; last come the models of cfplan. Taken is
-    a model in whose ranges they lie, from the first folder that has one, the one with the narrowest ranges; where there
-    is none, the nearest. None if there is no model at all.
+    `folders` are searched before the models of cfplan; each holds models, or is itself a model, which is then taken.
+    Taken is a model whose ranges contain vehicle and limits, from the first folder with one, and there the one with the
+    narrowest ranges; if there is none, the nearest model. None if there is no model at all.
 
     Raises:
         InputError: a model there is damaged, or a folder holds none.
@@ -203,7 +203,7 @@ def _card_versions(folder: Path) -> tuple[tuple[str, int, int, int], ...]:
 
 @lru_cache(maxsize=8)
 def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...], versions: tuple[Any, ...]) -> Model | None:
-    """Find a model as find_model() does; a change of the cards' `versions` has it read again."""
+    """Find a model as find_model() does; a change of the cards' `versions` reads it again."""
     known, candidates = scaled_limits(airframe, limits), []
     for place, folder in enumerate(folders):
         if (folder / CARD).is_file():
@@ -220,25 +220,25 @@ def _find(airframe: Airframe, limits: PlanLimits, folders: tuple[Path, ...], ver
 
 
 def _distance(card: Card, known: ScaledLimits) -> float:
-    """Return how far numbers lie outside of a model's ranges; 0 within."""
+    """Return the distance of numbers from a model's ranges; 0 within."""
     total = 0.0
     for here, (low, high) in zip(known.numbers, card.ranges.values(), strict=True):
         width = max(high - low, 1e-3)
-        total += min(max(low - here, here - high, 0.0) / width, FURTHEST)
+        total += min(max(low - here, here - high, 0.0) / width, MAX_DISTANCE)
     return total
 
 
 def _card(text: Mapping[str, Any]) -> Card:
-    """Return the card. Raises ValueError where a number is not one that a model can have."""
+    """Return the card. Raises ValueError if a number is outside of the range that a model can have."""
     from pydantic import TypeAdapter
 
     card = TypeAdapter(Card).validate_python(text)
     for name, value in {"hidden": card.hidden, "layers": card.layers, "window": card.window}.items():
-        if not 1 <= value <= LARGEST:
-            raise ValueError(f"{name} is {value}, not from 1 to {LARGEST}")
+        if not 1 <= value <= MAX_SIZE:
+            raise ValueError(f"{name} is {value}, not from 1 to {MAX_SIZE}")
     if tuple(card.ranges) != NUMBERS:
         raise ValueError(f"ranges are not of {', '.join(NUMBERS)}")
     for name, (low, high) in card.ranges.items():
-        if not -WIDEST <= low <= high <= WIDEST:
+        if not -MAX_RANGE_END <= low <= high <= MAX_RANGE_END:
             raise ValueError(f"the range of {name} is {low} to {high}")
     return card

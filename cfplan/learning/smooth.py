@@ -1,6 +1,6 @@
 """Smooth a network's answers into the coefficients of a cubic B-spline.
 
-Answers are joined to the three coefficients that are settled already, or to a rest, and smoothed by the
+Answers are joined to the three coefficients that are already known, or to a rest, and smoothed by the
 least sum of squared changes and squared third differences of log √u. The weight of the second depends on how long an
 interval takes, so that motion is smoothed over the same time on any grid. Where the path rests, four coefficients are
 equal, so that h stays constant over the first or last interval (see planners/expert/expert.py).
@@ -53,7 +53,7 @@ def smoothed(rates: NDArray, settled: NDArray, begin: int, rest_end: bool, durat
                 column = min(max(n + j, first), last) - first
                 if column <= row:
                     band[column, row - column] += stiffness * weights[i] * weights[j]
-    for n in range(held):  # what is settled goes to the other side
+    for n in range(held):  # known coefficients move to the right-hand side
         for k in range(1, _BAND + 1):
             if n + k >= held and n + k < size:
                 right[n + k] -= band[n, k] * settled[n]

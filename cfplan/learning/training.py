@@ -25,7 +25,7 @@ from cfplan import __version__
 from cfplan.errors import InputError
 from cfplan.learning import features, inference
 from cfplan.learning.checkpoints import Epoch, draw_curves, resume, save_checkpoint
-from cfplan.learning.learned import Question, predict
+from cfplan.learning.learned import Query, predict
 from cfplan.learning.model_files import Card, load_card, load_weights, save_model
 from cfplan.learning.networks import Architecture, build
 from cfplan.learning.smooth import travel_time
@@ -35,7 +35,7 @@ from cfplan.vehicle.yaw_spline import YawSpline
 
 CURVES = "curves.png"
 CHUNK = 4096  # windows drawn at once
-WARM_UP = 0.05  # of the steps, over which the learning rate rises; then it falls to nothing along a cosine
+WARM_UP = 0.05  # of the steps, over which the learning rate rises; then it falls to zero along a cosine
 CLIP = 1.0  # largest norm of the gradient
 NOISE_EPOCHS = 5  # between perturbations of the paths
 _DATA, _NOISE, _UNSEEN = 1, 2, 3  # streams of random numbers of one seed
@@ -267,9 +267,9 @@ class _Run:
         return self.noise[1]
 
     def _rate(self, step: int) -> float:
-        share = (step + 1) / (self.options.epochs * self.batches)
-        rise = min(1.0, share / WARM_UP)
-        fall = 0.5 * (1.0 + np.cos(np.pi * max(0.0, share - WARM_UP) / (1.0 - WARM_UP)))
+        progress = (step + 1) / (self.options.epochs * self.batches)
+        rise = min(1.0, progress / WARM_UP)
+        fall = 0.5 * (1.0 + np.cos(np.pi * max(0.0, progress - WARM_UP) / (1.0 - WARM_UP)))
         return float(self.options.rate * rise * fall)
 
     @torch.no_grad()
@@ -279,14 +279,14 @@ class _Run:
         return float(loss(self.network(inputs), targets, weights, times)[0])
 
     def _time_errors(self) -> NDArray:
-        """Return the relative error of travel time on each unseen path, planned whole as for a flight."""
+        """Return the relative error of travel time on each complete unseen path, planned as for a flight."""
         network = inference.NETWORKS[str(self.options.architecture)](self._weights())
         unseen, window = self.unseen, self.options.window
         nodes, labels = unseen.spec.nodes, unseen.labels
         if nodes < window:
             return np.full(len(unseen.paths), np.nan)
-        questions = [
-            Question(
+        queries = [
+            Query(
                 path, known, nodes, track=None if chooses else YawSpline(yaw[0], yaw[1], yaw[2, :-1]),
                 yaw_angle=float(yaw[0, 0]),
             )
@@ -295,8 +295,8 @@ class _Run:
             )
         ]  # fmt: skip
         found = [
-            travel_time(proposal.coefficients, question.path.end / nodes)
-            for question, proposal in zip(questions, predict(questions, network, window), strict=True)
+            travel_time(proposal.coefficients, query.path.end / nodes)
+            for query, proposal in zip(queries, predict(queries, network, window), strict=True)
         ]
         return np.array(found) / unseen.travel_time - 1.0
 
@@ -307,7 +307,7 @@ class _Run:
         self.network.scale.copy_(torch.where(spread > 1e-6, 1.0 / spread, torch.ones_like(spread)))
 
     def _start_from(self, folder: Path) -> Card:
-        """Take over the weights of a model; return its card. Raises InputError where its network is another."""
+        """Take over the weights of a model; return its card. Raises InputError if its network differs."""
         card, weights = load_weights(folder)
         for name in ("architecture", "hidden", "layers", "window"):
             there, here = getattr(card, name), getattr(self.options, name)
@@ -323,7 +323,7 @@ class _Run:
 
 
 def _plain(content: Any) -> dict[str, Any]:
-    """Return a dataclass as the card stores it: JSON has no tuples, and of a folder the name counts."""
+    """Return a dataclass as the card stores it: JSON has no tuples, and a folder is stored by its name."""
     plain: dict[str, Any] = json.loads(json.dumps(asdict(content), default=lambda folder: folder.name))
     return plain
 

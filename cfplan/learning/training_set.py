@@ -1,7 +1,7 @@
 """The training set: windows drawn from the labelled paths of a dataset, afresh for each epoch.
 
-A window begins at the path's start, ends at its end, or lies anywhere between, with nodes as close as flights have
-them or as wide as the labels. The start state that the network is given is a little wrong, as it is in a chain.
+A window begins at the path's start, ends at its end, or lies anywhere between, with nodes spaced as in
+flights or as in the labels. The start state that the network receives is slightly wrong, as in a chain of windows.
 """
 
 from dataclasses import dataclass, replace
@@ -36,17 +36,17 @@ from cfplan.safety.limits import PlanLimits
 from cfplan.vehicle.airframe import airframe_of
 from cfplan.vehicle.profile import h_within, yaw_within
 
-MIN_SPEED_FACTOR = 0.97  # at which a label must be certified to be learned from
+MIN_SPEED_FACTOR = 0.97  # at which a label must be certified to be used
 # m: the few longer paths are excursions of min-snap to hundreds of metres, and long flights are chains of windows
 MAX_LENGTH = 100.0
 CLOSEST = 0.12  # m of path between the nodes of the closest windows
 WIDEST = 2.0  # spacing of the widest windows, over the label's: as when a short path is one window
-AT_START, AT_END = 0.25, 0.25  # shares of windows that begin, or end, where the path does
-UNKNOWN = 0.8  # share of windows inside a path whose start state is withheld
+AT_START, AT_END = 0.25, 0.25  # fractions of the windows that begin, or end, where the path does
+UNKNOWN = 0.8  # fraction of the windows inside a path whose start state is withheld
 START_NOISE = (0.01, 0.01, 0.005)  # standard deviations of the noise on the start state: rate, slope, bend
 TAIL = 16  # nodes next to a window's end inside a path, whose speed depends on what lies beyond
 TAIL_WEIGHT = 0.1  # of the last of them in the loss
-UNSEEN_SHARE, MAX_UNSEEN = 0.1, 500  # of the paths, held out for validation
+UNSEEN_FRACTION, MAX_UNSEEN = 0.1, 500  # of the paths, held out for validation
 SPLIT_STREAM = 0  # number of this stream of a seed's random numbers
 
 
@@ -70,7 +70,7 @@ class Batch(NamedTuple):
     inputs: NDArray  # (B, W+1, INPUTS) float32
     targets: NDArray  # (B, W+1, OUTPUTS) float32
     weights: NDArray  # (B, W+1) float32, of the squared errors
-    times: NDArray  # (B, W+1) float32, share of the window's time that is spent about each node
+    times: NDArray  # float32, fraction of the window's time that is spent about each node
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,14 +92,14 @@ class TrainingSet:
         return replace(self, rows=self.rows[chosen], paths=paths, scaled=known, labels=labels, travel_time=travel_time)
 
     def noisy(self, epsilon: float, seed: np.random.SeedSequence) -> Labels:
-        """Return the labels with every path perturbed by at most epsilon, m: noise injection, the answers kept."""
+        """Return the labels with every path perturbed by at most epsilon, m: noise injection, with unchanged labels."""
         seeds = seed.spawn(len(self.paths))
         paths = tuple(perturbed(path, epsilon, own) for path, own in zip(self.paths, seeds, strict=True))
         return Labels(*_joined(paths, self.scaled), *self.labels[3:])
 
 
 def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> TrainingSet:
-    """Read the rows of a dataset that can be learned from.
+    """Read the usable rows of a dataset.
 
     Raises:
         InputError: no dataset, a damaged one, or no two paths that were solved and certified.
@@ -113,7 +113,7 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
     if usable.num_rows < 2:
         raise InputError(
             f"{usable.num_rows} of {rows.num_rows} rows are usable (solved, certified at {MIN_SPEED_FACTOR:.0%} of "
-            f"their speed, and no longer than {max_length:g} m); two are the least",
+            f"their speed, and no longer than {max_length:g} m); at least two are needed",
             where=str(folder),
             hint="see `cfplan dataset info`, and make another",
         )
@@ -128,7 +128,7 @@ def read_training_set(folder: FilePath, *, max_length: float = MAX_LENGTH) -> Tr
     row_numbers = usable["row"].to_numpy()
     if len(np.unique(row_numbers // (1 + spec.copies))) < 2:
         raise InputError(
-            "only one path to learn from and to be judged on", where=str(folder), hint="make a dataset of more paths"
+            "only one path, and validation needs another", where=str(folder), hint="make a dataset of more paths"
         )
     return TrainingSet(spec, row_numbers, paths, known, labels, travel_time)
 
@@ -197,11 +197,11 @@ def _joined(paths: tuple[Path, ...], known: tuple[ScaledLimits, ...]) -> tuple[N
 
 
 def split(training_set: TrainingSet, seed: int) -> tuple[TrainingSet, TrainingSet]:
-    """Return what to learn from and, held out for validation, the unseen. A path's copies go where it goes."""
+    """Return the training set and, held out for validation, the unseen. A path's copies stay with it."""
     paths = training_set.rows // (1 + training_set.spec.copies)
     known = np.unique(paths)
     order = np.random.default_rng([seed, SPLIT_STREAM]).permutation(known)
-    count = min(MAX_UNSEEN, max(1, round(UNSEEN_SHARE * len(known))))
+    count = min(MAX_UNSEEN, max(1, round(UNSEEN_FRACTION * len(known))))
     apart = np.isin(paths, order[:count])
     return training_set.part(np.flatnonzero(~apart)), training_set.part(np.flatnonzero(apart))
 

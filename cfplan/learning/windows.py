@@ -1,7 +1,7 @@
-"""Windows: a path of any length as overlapping windows of as many intervals each, all answered at once.
+"""Windows: cover a path of any length with overlapping windows of equal size, all answered at once.
 
-Near its ends a window does not see what its answers depend on: there they count less, and where windows overlap the
-answers pass over from the one to the other.
+Near its ends a window does not see all that its answers depend on: they have less weight there, and where windows
+overlap the answers blend from one to the next.
 """
 
 from functools import lru_cache
@@ -10,23 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 WINDOW = 64  # intervals of a window
-OVERLAP_SHARE = 0.375  # of a window, that the next one has too, at least
-UNSEEN_SHARE = 0.25  # of that overlap, next to a window's end, where its answers do not count
-_LEAST = 1e-6  # weight, so that some window counts everywhere
+OVERLAP_FRACTION = 0.375  # of a window, that the next one covers too, at least
+UNSEEN_FRACTION = 0.25  # of that overlap, next to a window's end, where its answers have no weight
+_MIN_WEIGHT = 1e-6  # so that every node has an answer
 
 
 def window_starts(nodes: int, window: int) -> NDArray:
     """Return the first nodes of the windows, (B,), over `nodes` intervals, which are at least `window`."""
-    most = window - round(OVERLAP_SHARE * window)
+    most = window - round(OVERLAP_FRACTION * window)
     count = 1 + -(-(nodes - window) // most)
     return np.round(np.linspace(0, nodes - window, count)).astype(np.int64)
 
 
-def shares(starts: NDArray, window: int) -> NDArray:
-    """Return (B, W+1): how much each window's answers count at its nodes; at every node they add up to 1."""
-    overlap = OVERLAP_SHARE * window
-    rise = (np.arange(window + 1) / overlap - UNSEEN_SHARE) / (1.0 - 2.0 * UNSEEN_SHARE)
-    rise = np.clip(rise, _LEAST, 1.0)
+def window_weights(starts: NDArray, window: int) -> NDArray:
+    """Return the weight of each window's answers at its nodes, (B, W+1); at every node they add up to 1."""
+    overlap = OVERLAP_FRACTION * window
+    rise = (np.arange(window + 1) / overlap - UNSEEN_FRACTION) / (1.0 - 2.0 * UNSEEN_FRACTION)
+    rise = np.clip(rise, _MIN_WEIGHT, 1.0)
     out = np.ones((len(starts), window + 1))
     out[1:] *= rise
     out[:-1] *= rise[::-1]
@@ -36,12 +36,12 @@ def shares(starts: NDArray, window: int) -> NDArray:
 
 @lru_cache(maxsize=16)
 def windows_over(nodes: int, window: int) -> tuple[NDArray, NDArray]:
-    """Return window_starts() of so many intervals, (B,), and the windows' shares(), (B, W+1)."""
+    """Return window_starts() over `nodes` intervals, (B,), and the window_weights(), (B, W+1)."""
     starts = window_starts(nodes, window)
-    counts = shares(starts, window)
-    for array in (starts, counts):
+    weights = window_weights(starts, window)
+    for array in (starts, weights):
         array.setflags(write=False)
-    return starts, counts
+    return starts, weights
 
 
 def overlapped(starts: NDArray, values: NDArray) -> NDArray:

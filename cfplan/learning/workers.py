@@ -25,10 +25,10 @@ class SchedulerError(CfplanError):
 def pool(
     workers: int = 1, scheduler: str | None = None, *, worker_patience: float = WORKER_PATIENCE
 ) -> Iterator[Work[Any]]:
-    """Yield a function that calls another on each item, and yields what that returns as it is done, in any order.
+    """Yield a function that maps another over items in parallel and yields results as they arrive, in any order.
 
-    One worker without a scheduler works in this process. A worker of a cluster that dies costs only the items that it
-    had; they are done again by others.
+    One worker without a scheduler works in this process. If a worker of a cluster dies, others repeat only the items
+    that it had.
 
     Raises:
         SchedulerError: Dask is not installed, the scheduler does not answer within SCHEDULER_PATIENCE, no worker comes
@@ -75,7 +75,7 @@ def _client(scheduler: str, worker_patience: float) -> Iterator[object]:
 
 
 def _require_workers(client: Any, scheduler: str, patience: float) -> None:
-    """Check that somebody works there, and one item at a time: what is measured of an item is its process's time."""
+    """Check that there are workers, of one thread each: an item is timed by its process."""
     command = f"`dask worker --nworkers -1 --nthreads 1 {scheduler}`"
     try:
         client.wait_for_workers(1, timeout=patience)
@@ -93,7 +93,7 @@ def _require_workers(client: Any, scheduler: str, patience: float) -> None:
 
 
 def _require_listening(scheduler: str) -> None:
-    """Check that something listens there: Dask would try for long and log much."""
+    """Check that the address accepts connections: Dask would retry for long and log much."""
     parts = urlsplit(scheduler)
     try:
         if parts.scheme != "tcp" or parts.hostname is None or parts.port is None:

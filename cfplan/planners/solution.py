@@ -23,6 +23,6 @@ class Solution:
 
     status: Status
     profile: SpeedProfile | None  # None exactly when the status is not SOLVED
-    reason: str = ""  # the solver's message, for people: why there is no profile, or which part of it is no solution
+    reason: str = ""  # the solver's message: why there is no profile, or which part of it is not solved
     stats: Mapping[str, float | int | str] = field(default_factory=dict)  # solve_seconds, iterations, solver, …
     joints: tuple[float, ...] = ()  # s, where the windows of a long path meet

@@ -1,4 +1,4 @@
-"""PlanningTask: what every planner is asked, checked once where it is made."""
+"""PlanningTask: the input of every planner, checked once where it is made."""
 
 import math
 import pathlib
@@ -25,7 +25,7 @@ FREE_START = math.pi / 2  # rad, from the angle given on, within which yaw begin
 class PlanningTask:
     """A path to be flown as fast as the limits allow, from a boundary state or from rest.
 
-    Raises InputError where a number is not finite. What the limits exclude is no error but an answer: see `refusal`.
+    Raises InputError where a number is not finite. Limits that exclude every plan raise no error: see `refusal`.
     """
 
     path: Path
@@ -33,15 +33,15 @@ class PlanningTask:
     limits: PlanLimits
     nodes: int = 100  # intervals of the grid, uniform in s
     yaw: YawMode = YawMode.FIXED
-    yaw_angle: float = 0.0  # rad: held where yaw is FIXED; where FREE it begins within FREE_START from there on
+    yaw_angle: float = 0.0  # rad: held where yaw is FIXED; where FREE, it begins within FREE_START above it
     start: BoundaryState | None = None  # None: free within the limits (a rest end)
     speed_caps: SpeedCaps | None = None  # along the path, besides the limit on speed
     deadline: Deadline = field(default=NEVER, compare=False, repr=False)  # by which to answer, if only with a reason
-    dispensable: bool = field(default=False, compare=False, repr=False)  # given up where it is late: others answered
+    dispensable: bool = field(default=False, compare=False, repr=False)  # abandoned at the deadline: others answered
     models: tuple[pathlib.Path, ...] = ()  # of the learned planner: folders of models, or one of a model itself
     refusal: Solution | None = field(init=False, compare=False, repr=False)
-    """The answer of a planner that keeps all limits and boundary states, where no search is needed to see that none
-    can be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""
+    """The solution of a planner that keeps all limits and boundary states, if no search is needed to see that none can
+    be kept: the limits exclude hovering, or a boundary state breaks them. Other planners may answer otherwise."""
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.yaw_angle):
@@ -78,10 +78,10 @@ class PlanningTask:
         return f"speed is {speed:.4g} m/s, the cap {cap:.4g} m/s" if speed > (1.0 + BOUNDARY_TOLERANCE) * cap else ""
 
     def check_nodes(self) -> None:
-        """Refuse fewer nodes than the path has shape for; for planners that lay a spline over the grid.
+        """Refuse fewer nodes than the path's shape needs; for planners that lay a spline over the grid.
 
         Raises:
-            InputError: too few nodes; says how many are enough.
+            InputError: too few nodes; the hint names the least number.
         """
         pieces = len(self.path.breaks) - 1
         least = max(LEAST_NODES, NODES_PER_PIECE * pieces)
@@ -92,4 +92,4 @@ class PlanningTask:
             )
 
 
-Planner = Callable[[PlanningTask], Solution]  # any way to find a speed profile: expert, learned, or baseline
+Planner = Callable[[PlanningTask], Solution]  # an expert, learned, or baseline planner

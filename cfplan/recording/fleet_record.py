@@ -1,4 +1,4 @@
-"""The record of a fleet's flight: a folder with a record per vehicle, and fleet.json, which says whose they are.
+"""The record of a fleet's flight: a folder with a record per vehicle, and fleet.json, which names them.
 
 All vehicles of a fleet are flown by one computer, so their records share its clock. Time 0 is where the first of them
 begins its path.
@@ -25,16 +25,16 @@ from cfplan.recording.record import Record
 from cfplan.recording.summary import UNKNOWN, reference_span
 
 FLEET_FILE = "fleet.json"
-LONGEST_GAP = 0.1  # s between two poses, over which a straight line still says where a vehicle was
+LONGEST_GAP = 0.1  # s between two poses, longest gap bridged by a straight line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PairDistance:
-    """How far the columns of two vehicles were from each other, at each pose of the first."""
+    """The distance between the columns of two vehicles, at each pose of the first."""
 
     pair: tuple[str, str]
     time: NDArray  # (N,) s from the fleet's start
-    distance: NDArray  # (N,) m, horizontal, at whatever heights; NaN where the second was not seen
+    distance: NDArray  # (N,) m, horizontal, at any heights; NaN where the second was not seen
     place: NDArray  # (N, 2) m, x and y, in the middle between them
 
     @property
@@ -77,12 +77,12 @@ class FleetRecord:
         return tuple(_pair(a, b) for a, b in itertools.combinations(self.trials, 2))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the nearest approach of each pair, and what is missing, for JSON."""
+        """Return the nearest approach of each pair, and the notes, for JSON."""
         pairs = [pair.to_json() for pair in self.pairs()]
         return {"fleet": self.name, "apart": self.apart, "pairs": pairs, "missing": list(self.notes)}
 
     def pair_rows(self) -> list[tuple[str, ...]]:
-        """Return a row of text per pair, the nearest first: names, least distance, that planned, time, place."""
+        """Return a row of text per pair, the nearest first: names, least distance, planned distance, time, place."""
         rows: list[tuple[str, ...]] = []
         for pair in sorted(self.pairs(), key=lambda each: np.fmin.reduce(each.distance, initial=np.inf)):
             row, names = pair.nearest, " – ".join(pair.pair)
@@ -96,7 +96,7 @@ class FleetRecord:
 
 
 def distances_to_others(trials: tuple[Trial, ...]) -> list[NDArray]:
-    """Return of each trial how far the nearest other was at each of its poses, (N,) m; NaN where none was seen."""
+    """Return the distance to the nearest other at each pose of each trial, (N,) m; NaN where none was seen."""
     found = []
     for trial in trials:
         others = [_pair(trial, other).distance for other in trials if other is not trial]
@@ -172,7 +172,7 @@ def _pair(a: Trial, b: Trial) -> PairDistance:
 
 
 def _columns_at(trial: Trial, times: NDArray) -> NDArray:
-    """Return x and y at each of the times, straight between poses, (N, 2) m; NaN where there are none near."""
+    """Return x and y at each of the times, straight between poses, (N, 2) m; NaN in gaps."""
     seen = np.isfinite(trial.position).all(axis=1)
     time, position = trial.time[seen], trial.position[seen, :2]
     if len(time) < 2:

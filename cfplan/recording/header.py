@@ -63,7 +63,7 @@ class RecordHeader:
     fence: tuple[Triple, Triple]  # m, lower and upper corner
     wall_time_at_zero: float  # s since 1970, when time.monotonic() was zero
     provenance: Mapping[str, str] = field(default_factory=dict)
-    """Where the plan came from: file, model hash, …"""
+    """Origin of the plan: file, model hash, …"""
     obstacles: tuple[Obstacle, ...] = ()
     shift: NDArray = field(default_factory=_NO_SHIFT.copy)
     """(N, 3) m, correction of setpoints 0 … of the plan by earlier flights; empty if there is none."""

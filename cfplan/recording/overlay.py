@@ -80,7 +80,7 @@ class Alignment:
     aside: tuple[float, float, float]  # m, mean of the log minus the plan
     max_deviation: float  # m
     rms_deviation: float  # m
-    alike: bool  # whether the log looks like a flight of the plan at all
+    alike: bool  # whether the log resembles a flight of the plan
 
     def __str__(self) -> str:
         return (
@@ -164,7 +164,7 @@ def align(subject: LoggedSubject, reference: Reference) -> Alignment:
 
 
 def _on_grid(time: NDArray, position: NDArray, reference: Reference) -> tuple[float, float]:
-    """Return the best offset in steps of STEP, and the share of the plan's variance left between log and plan."""
+    """Return the best offset in steps of STEP, and the fraction of the plan's variance left between log and plan."""
     centre = reference.position.mean(axis=0)
     plan_grid = np.arange(0.0, reference.time[-1] + STEP / 2, STEP)
     plan = np.stack([np.interp(plan_grid, reference.time, axis) for axis in (reference.position - centre).T], axis=1)
@@ -197,7 +197,7 @@ def _correlated(log: NDArray, plan: NDArray) -> NDArray:
 def _refined_time(guess: float, time: NDArray, position: NDArray, reference: Reference) -> float:
     """Return the offset near a guess at which the difference of log and plan varies least.
 
-    The seen part of the plan changes with the offset, which draws the guess by a few steps: here that part is fixed.
+    The seen part of the plan changes with the offset, which biases the guess by a few steps: here that part is fixed.
     """
     moments = reference.time + guess
     fixed = _near(moments - NEARBY, time) & _near(moments + NEARBY, time)

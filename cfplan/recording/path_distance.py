@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 
-BLOCK = 32  # segments that are passed over at once where the box around them is farther away than what is found
+BLOCK = 32  # segments that are skipped together if the box around them is farther away than the nearest so far
 
 
 def distance_to_path(points: NDArray, path: NDArray) -> NDArray:

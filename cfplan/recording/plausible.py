@@ -1,4 +1,4 @@
-"""Refuse times and places that no flight has, where a record or a log is read."""
+"""Refuse implausible times, places and values when a record or a log is read."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,14 +6,14 @@ from numpy.typing import NDArray
 from cfplan.errors import InputError
 from cfplan.numbers import coordinates
 
-LONGEST = 12 * 3600.0  # s, from the first time to the last; more cost memory and minutes wherever times are compared
+LONGEST = 12 * 3600.0  # s, from the first time to the last; longer spans cost memory and minutes in comparing times
 _LATEST = 1e11  # s; microseconds taken for seconds are later
 _FARTHEST = 1e4  # m, from the origin
-_LARGEST = 1e11  # of any number, in SI; squares of larger ones would not fit what draws them
+_LARGEST = 1e11  # of any number, in SI; squares of larger ones would overflow in drawing
 
 
 def check_times(time: NDArray, name: str, *, where: str) -> None:
-    """Raise InputError where a time, (N,) s, is no number, or is absurd, or where all of them span too long."""
+    """Raise InputError if a time, (N,) s, is not finite or implausible, or if the times span too long."""
     if len(time) == 0:
         return
     wrong = np.flatnonzero(~(np.abs(time) <= _LATEST))
@@ -33,7 +33,7 @@ def check_times(time: NDArray, name: str, *, where: str) -> None:
 
 
 def check_places(position: NDArray, name: str, *, where: str) -> None:
-    """Raise InputError where a position, (N, 3) m, is farther away than any flight; NaN is not seen."""
+    """Raise InputError if a position, (N, 3) m, is implausibly far away; NaN means not seen."""
     wrong = np.flatnonzero((np.abs(position) > _FARTHEST).any(axis=1))
     if len(wrong):
         raise InputError(
@@ -44,7 +44,7 @@ def check_places(position: NDArray, name: str, *, where: str) -> None:
 
 
 def check_values(values: NDArray, name: str, *, where: str) -> None:
-    """Raise InputError where a number, (N,) or (N, K), is larger than anything that is measured; NaN is not known."""
+    """Raise InputError if a number, (N,) or (N, K), is implausibly large; NaN means not known."""
     if values.dtype.kind != "f":
         return
     wrong = np.argwhere(np.abs(values) > _LARGEST)

@@ -12,7 +12,7 @@ from cfplan.recording.record import Record, meant_motion
 from cfplan.recording.summary import deviation, reference_span, reference_times
 from cfplan.vehicle.motor_commands import command_shares
 
-FAR_LIMIT = 2.0  # times the measured span beyond it, from which on a limit is not drawn
+FAR_LIMIT = 2.0  # measured spans beyond the values, above which a limit is not drawn
 
 Colour = tuple[int, int, int]
 FLOWN: Colour = (86, 180, 233)
@@ -53,7 +53,7 @@ class Plot:
 
     @property
     def title(self) -> str:
-        """Return what it shows, with the unit."""
+        """Return the plotted quantity, with its unit."""
         return TITLES[self.name]
 
 
@@ -111,7 +111,7 @@ def plots(record: Record) -> tuple[Plot, ...]:
 
 
 def _along_the_path(record: Record) -> tuple[float, float]:
-    """Return s, from when to when the vehicle is on the path or hovers at its end; always, where it never was."""
+    """Return begin and end, s, of the path with the hover at its end; infinite if it was never flown."""
     begin, end = reference_span(record)
     if math.isnan(begin):
         return -math.inf, math.inf
@@ -126,7 +126,7 @@ def motor_thrust(record: Record) -> NDArray:
 
 
 def pose_age(record: Record) -> tuple[NDArray, NDArray]:
-    """Return when each pose but the first came (N-1,), and how old the one before it was by then (N-1,), both s."""
+    """Return the arrival of each pose but the first, (N-1,), and the age of the previous pose then, (N-1,), both s."""
     return record.poses.received[1:], record.poses.received[1:] - record.poses.time[:-1]
 
 
@@ -136,7 +136,7 @@ def finite_limits(plot: Plot) -> tuple[float, ...]:
 
 
 def near_limits(limits: Sequence[float], values: Sequence[NDArray]) -> tuple[float, ...]:
-    """Return the limits beside which the values can still be seen: at most FAR_LIMIT of their span beyond them."""
+    """Return the limits that are near enough to draw: at most FAR_LIMIT spans of the values beyond them."""
     known = np.concatenate([np.empty(0), *(array[np.isfinite(array)] for array in values)])
     if len(known) == 0:
         return tuple(limits)

@@ -1,7 +1,7 @@
-"""What a record holds for others: poses, the vehicle's frame, the room and the log by Foxglove's public schemas.
+"""Public topics of a record: poses, the vehicle's frame, the room and the log, in Foxglove's schemas.
 
-Foxglove, rerun and PlotJuggler show these without cfplan; cfplan reads its own topics alone. Protobuf is the encoding
-that all three know. Frames are `room`, and `vehicle` where the vehicle believes itself.
+Foxglove, rerun and PlotJuggler show these without cfplan; cfplan itself reads only its own topics. All three support
+Protobuf. Frames are `room`, and `vehicle` at the vehicle's own estimate.
 """
 
 import math
@@ -34,7 +34,7 @@ _LEVELS = {
 
 
 class PublicTopics:
-    """Adds to a record's MCAP file what others read."""
+    """Adds the public topics to a record's MCAP file."""
 
     def __init__(self, mcap: Writer, header: RecordHeader, nanoseconds: Callable[[float], int]):
         self._mcap, self._header, self._nanoseconds = mcap, header, nanoseconds
@@ -45,7 +45,7 @@ class PublicTopics:
         self._has_scene = False
 
     def add(self, message: telemetry.Telemetry) -> None:
-        """Add what a message tells others, if anything; the room and the path come with the first."""
+        """Add the public topics of a message, if it has any; the room and the path come with the first."""
         log_time = self._nanoseconds(getattr(message, "received", message.time))
         if not self._has_scene:
             self._has_scene = True

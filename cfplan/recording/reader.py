@@ -1,4 +1,4 @@
-"""Read a record back, whole or as far as it goes."""
+"""Read a record, complete or as far as it is readable."""
 
 import io
 import json
@@ -51,8 +51,8 @@ _DAMAGE = (
 def read_record(place: Path) -> Record:
     """Read the record in a folder, or in the MCAP file itself.
 
-    What was cut off or damaged is left out, and `truncated` says so. Raises InputError where the place holds no record
-    of cfplan, or not even its header.
+    Parts that were cut off or damaged are left out, and `truncated` is set. Raises InputError if the place holds no
+    record of cfplan, or not even its header.
     """
     file = _find(Path(place))
     data = _read(file)
@@ -88,7 +88,7 @@ def read_record(place: Path) -> Record:
 
 
 def _check_plausible(record: Record, file: Path) -> None:
-    """Raise InputError where a message has a time or a place that no flight has."""
+    """Raise InputError if a message has an implausible time or place."""
     for topic in TOPICS:
         stream = getattr(record, topic.stream)
         check_times(stream.time, topic.name, where=str(file))
@@ -181,7 +181,7 @@ def _header(values: Mapping[str, str], file: Path) -> RecordHeader:
 
 
 def _entries(data: bytes, place: int, payloads: dict[int, list[bytes]]) -> Iterator[McapRecord]:
-    """Yield the MCAP records that matter from `place` on, those in chunks too, up to the first cut off or damaged.
+    """Yield the relevant MCAP records from `place` on, also those in chunks, up to the first cut off or damaged.
 
     Messages are too many to be objects: their contents are put into `payloads` by their channel.
     """

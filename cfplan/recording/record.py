@@ -1,4 +1,4 @@
-"""Everything that a flight measured, commanded and decided, on one clock, as columns."""
+"""The record of a flight: its measurements, commands and decisions, on one clock, as columns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from cfplan.vehicle.rotations import quaternions_of
 FLIGHT_FILE = "flight.mcap"
 SUMMARY_FILE = "summary.json"
 PLAN_FILE = "plan.parquet"
-UNCORRECTED_FILE = "uncorrected.parquet"  # the plan where the vehicle was wanted, if what was sent is corrected
+UNCORRECTED_FILE = "uncorrected.parquet"  # the plan before its correction, if it was corrected
 PLAN_IN_FLIGHT = "plan-{:08x}.parquet"  # by the checksum of its proposal, see Commitments
 
 
@@ -36,9 +36,9 @@ class Setpoints:
 
 
 def meant_motion(setpoints: Setpoints) -> tuple[NDArray, NDArray, NDArray]:
-    """Return attitudes (N, 4), accelerations (N, 3) and body rates (N, 3) that setpoints make the vehicle fly.
+    """Return the attitudes (N, 4), accelerations (N, 3) and body rates (N, 3) that setpoints stand for.
 
-    Packets carry others, as most of the roll and pitch rates is sent as attitude.
+    The packets themselves differ, as most of the roll and pitch rates is sent as attitude.
     """
     if not len(setpoints.due):
         return setpoints.quaternion, setpoints.acceleration, setpoints.body_rate
@@ -81,7 +81,7 @@ class StatusReports:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Phases:
-    """When the pilot entered which phase."""
+    """The phases of the pilot and when each began."""
 
     time: NDArray  # (N,) s
     phase: NDArray  # (N,) str, a value of telemetry.Phase
@@ -102,13 +102,13 @@ class Commitments:
 
     time: NDArray  # (N,) s
     splice: NDArray  # (N,) int, number of the first of them
-    checksum: NDArray  # (N,) int, of the proposal; 0 for what the flight began with
+    checksum: NDArray  # (N,) int, of the proposal; 0 for the commitment at the beginning
     payloads: NDArray  # (N,) bytes, 29 a setpoint
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Requests:
-    """The changes of the path that were asked for; see telemetry.PathRequested."""
+    """The requested changes of the path; see telemetry.PathRequested."""
 
     time: NDArray  # (N,) s
     number: NDArray  # (N,) int
@@ -118,7 +118,7 @@ class Requests:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Answers:
-    """What became of the requests; see telemetry.PathAnswered."""
+    """The answers to the requests; see telemetry.PathAnswered."""
 
     time: NDArray  # (N,) s
     number: NDArray  # (N,) int, of the request
@@ -138,7 +138,7 @@ _NO_ANSWERS = Answers(*[_NONE] * 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """A flight as it was; times are those of time.monotonic() on the machine that flew it."""
+    """A recorded flight; times are those of time.monotonic() on the machine that flew it."""
 
     folder: Path
     header: RecordHeader

@@ -23,8 +23,8 @@ from cfplan.safety.limits import PlanLimits
 
 UNKNOWN = "–"
 SETTLED = 0.03  # m from the end of the path: close enough to call the flight settled
-SPEED_SPAN = 0.06  # s over which poses tell speed: 1 mm of noise is 0.02 m/s
-_ALMOST = 0.1  # s before a plan's end, from when on packets may show a hover, with which a stream on board ends
+SPEED_SPAN = 0.06  # s, span over which speed is computed from poses: 1 mm of noise is 0.02 m/s
+_HOVER_SPAN = 0.1  # s before a plan's end, in which packets may show the hover that ends a stream on board
 DROPOUT = 3.0  # usual intervals between poses: a longer gap is a dropout
 
 
@@ -34,14 +34,14 @@ class FlightSummary:
 
     travel_time_planned: float  # s
     travel_time_flown: float
-    """s, planned, and by how much later than its setpoints the vehicle came within SETTLED of the path's end to stay;
-    NaN where the path was not finished."""
+    """s, planned, plus the delay behind the setpoints until the vehicle stays within SETTLED of the path's end; NaN if
+    the path was not finished."""
     settling: float  # s, from the end of the reference until the vehicle stays within SETTLED of the path's end
     max_deviation: float  # m, from the reference in time
     rms_deviation: float  # m
     max_deviation_to_path: float  # m, from the nearest point of the path
     rms_deviation_to_path: float  # m
-    estimated_speed: float  # share by which the vehicle's estimate is faster than the poses, along the path
+    estimated_speed: float  # fraction by which the vehicle's estimate is faster than the poses, along the path
     peak_speed: float  # m/s, by the vehicle's estimate, along the path
     peak_acceleration: float  # m/s², gravity not counted, by the vehicle's estimate, along the path
     peak_body_rate: float  # rad/s, norm, along the path
@@ -62,7 +62,7 @@ class FlightSummary:
 
 
 class PoseDeviations(NamedTuple):
-    """How far the vehicle was from where it should have been, at each pose."""
+    """The deviation of the vehicle, at each pose."""
 
     time: NDArray  # (N,) s, of the poses
     in_time: NDArray  # (N,) m, from the reference at that time
@@ -102,10 +102,10 @@ def summarise(record: Record) -> FlightSummary:
 
 
 def reference_span(record: Record) -> tuple[float, float]:
-    """Return s from the first deadline of the phase `stream`, where the plan begins, to where it ends.
+    """Return begin and end of the reference, s: the first deadline of the phase `stream`, and the end of the plan.
 
-    Of a plan not sent to its end that is LEAD after the last deadline, the time for which that setpoint was made.
-    What is streamed longer is the hover after the end of the path. NaN where nothing was streamed.
+    If the plan was not sent to its end, its end is LEAD after the last deadline, the time for which that setpoint was
+    made. Anything streamed later is the hover after the path. NaN if nothing was streamed.
     """
     due = _streamed(record)
     if len(due) == 0:
@@ -127,7 +127,7 @@ def _streamed(record: Record) -> NDArray:
 
 
 def reference_times(setpoints: Setpoints) -> NDArray:
-    """Return (N,) s, when the plan has the vehicle at each setpoint: LEAD after the deadline that it was made for."""
+    """Return the planned time of each setpoint, (N,) s: LEAD after the deadline that it was made for."""
     return _deadlines(setpoints) + LEAD
 
 
@@ -140,7 +140,7 @@ def _deadlines(setpoints: Setpoints) -> NDArray:
 
 
 def planned_positions(record: Record) -> NDArray:
-    """Return where the plan has the vehicle at each setpoint, (N, 3) m: what was sent, less a correction."""
+    """Return the planned position at each setpoint, (N, 3) m: as sent, less the correction."""
     sent, shift, due = record.setpoints, record.header.shift, _streamed(record)
     if not (len(shift) and len(due) > 1):
         return sent.position
@@ -164,9 +164,9 @@ def deviation(record: Record, begin: float = -math.inf, end: float = math.inf) -
 
 
 def estimated_speed(record: Record, begin: float, end: float) -> float:
-    """Return by which share the vehicle's estimate is faster than the poses between begin and end.
+    """Return the fraction by which the vehicle's estimate is faster than the poses between begin and end.
 
-    A vehicle that believes itself slower than it is flies ahead of its setpoints. NaN where nothing moves or is known.
+    A vehicle whose estimate is too slow flies ahead of its setpoints. NaN if nothing moves or is known.
     """
     estimates, time = record.estimates, record.poses.time
     seen = np.isfinite(time) & np.all(np.isfinite(record.poses.position), axis=1)
@@ -184,15 +184,15 @@ def estimated_speed(record: Record, begin: float, end: float) -> float:
 def settling(record: Record) -> float:
     """Return s after the end of the reference until the vehicle, held at the path's end, stays within SETTLED of it.
 
-    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
+    NaN if the path was not finished, there is no pose, or the vehicle was still outside at the end.
     """
     return max(arrival(record)[0] - reference_span(record)[1], 0.0)
 
 
 def arrival(record: Record) -> tuple[float, float]:
-    """Return s, from when on the vehicle, and its setpoints, stay within SETTLED of the path's end.
+    """Return the times, s, from which on the vehicle, and its setpoints, stay within SETTLED of the path's end.
 
-    NaN where the path was not finished, where there is no pose, or where the vehicle was still outside at the last.
+    NaN if the path was not finished, there is no pose, or the vehicle was still outside at the end.
     """
     begin, end = reference_span(record)
     held = record.phase_span(Phase.HOLD)
@@ -210,7 +210,7 @@ def arrival(record: Record) -> tuple[float, float]:
 
 
 def _from_then_near(time: NDArray, position: NDArray, goal: NDArray) -> float:
-    """Return s, from when on all positions are within SETTLED of the goal, straight between them; NaN if never."""
+    """Return the time, s, after which positions, linearly interpolated, stay within SETTLED of the goal; else NaN."""
     off = np.linalg.norm(position - goal, axis=1)
     outside = np.flatnonzero(~(off <= SETTLED))
     if len(time) == 0 or (len(outside) and outside[-1] == len(time) - 1):
@@ -218,8 +218,8 @@ def _from_then_near(time: NDArray, position: NDArray, goal: NDArray) -> float:
     if not len(outside):
         return float(time[0])
     last = outside[-1]
-    share = (off[last] - SETTLED) / (off[last] - off[last + 1]) if math.isfinite(off[last]) else 1.0
-    return float(time[last] + share * (time[last + 1] - time[last]))
+    fraction = (off[last] - SETTLED) / (off[last] - off[last + 1]) if math.isfinite(off[last]) else 1.0
+    return float(time[last] + fraction * (time[last + 1] - time[last]))
 
 
 def finished(record: Record) -> bool:
@@ -229,7 +229,7 @@ def finished(record: Record) -> bool:
         return False
     period = float(np.median(np.diff(due)))
     last = int(record.setpoints.index[np.searchsorted(record.setpoints.due, due[-1])])
-    least = committed_time(record) - _ALMOST
+    least = committed_time(record) - _HOVER_SPAN
     return bool(due[-1] - due[0] >= least and last * period >= least)
 
 
@@ -248,13 +248,13 @@ PLAN_LIMITS = {"peak_speed": "speed", "peak_acceleration": "acceleration", "peak
 
 
 def shares(summary: FlightSummary, limits: PlanLimits) -> dict[str, float]:
-    """Return each peak's share of the plan's limit; NaN where the record holds no peak or no limit."""
+    """Return the usage of the plan's limit by each peak; NaN if the record holds no peak or no limit."""
     allowed = {peak: getattr(limits, limit) for peak, limit in PLAN_LIMITS.items()}
     return {peak: getattr(summary, peak) / most if most > 0.0 else math.nan for peak, most in allowed.items()}
 
 
 def summary_rows(summary: FlightSummary, limits: PlanLimits) -> list[tuple[str, str]]:
-    """Return what each number is and its value as people read it; peaks with their share of the plan's limit."""
+    """Return name and text of each number; peaks with their usage of the plan's limit."""
     of_limits = shares(summary, limits)
 
     def peak(name: str, unit: str) -> str:
@@ -285,7 +285,7 @@ def summary_rows(summary: FlightSummary, limits: PlanLimits) -> list[tuple[str, 
 def summary_text(record: Record) -> str:
     """Return a heading, a table of the numbers, and what flew, in Markdown; a dash for what is not known."""
     header = record.header
-    cut = ["**The record ends early: what follows its last whole chunk is lost.**", ""] if record.truncated else []
+    cut = ["**The record ends early: data after its last complete chunk is lost.**", ""] if record.truncated else []
     lines = [
         f"## {header.name}",
         "",
@@ -328,5 +328,5 @@ def _rms(values: NDArray) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
 
 
-def _percentile(values: NDArray, share: float) -> float:
-    return float(np.percentile(values, share)) if len(values) else math.nan
+def _percentile(values: NDArray, fraction: float) -> float:
+    return float(np.percentile(values, fraction)) if len(values) else math.nan

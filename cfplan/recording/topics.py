@@ -97,10 +97,10 @@ def columns_from_json(topic: Topic, payloads: list[bytes]) -> Any:
     if not payloads:
         return topic.columns(**{name: _column([], hints[name]) for name in names})
     for name in names:
-        json.loads(payloads[0])[name]  # Arrow takes what is missing for null
+        json.loads(payloads[0])[name]  # Arrow reads a missing field as null
     schema = pa.schema([(name, _arrow_type(hints[name])) for name in names])
     lines = b"\n".join(payloads)
-    if lines.count(b"\n") >= len(payloads):  # others than we may spread a message over lines
+    if lines.count(b"\n") >= len(payloads):  # other writers may spread a message over lines
         lines = b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)
     table = pa_json.read_json(
         pa.BufferReader(lines),
@@ -156,7 +156,7 @@ def _column(values: list[Any], kind: Any) -> NDArray:
 
 
 def _objects(values: list[Any]) -> NDArray:
-    """Return (N,) objects, whatever their lengths."""
+    """Return (N,) objects of any lengths."""
     out = np.empty(len(values), dtype=object)
     out[:] = values
     return out

@@ -165,7 +165,7 @@ class RecordWriter:
             self._sink.flush()
 
     def _try(self, action: Callable[..., None], what: str, *arguments: Any) -> None:
-        """Do it; warn of the first failure of all. None may reach the flight."""
+        """Run the action; warn of the first failure of all. No exception may reach the flight."""
         try:
             action(*arguments)
         except Exception as error:

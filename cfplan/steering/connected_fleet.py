@@ -51,7 +51,7 @@ from cfplan.steering.fleet_addresses import VehicleAddress, fleet_addresses, loo
 from cfplan.steering.fleet_room import FleetRoom, VehiclePlace
 from cfplan.steering.real_time_steering import main_module_hidden
 
-_LOOK_PERIOD = 0.02  # s between looks whether what is waited for has come
+_LOOK_PERIOD = 0.02  # s between checks of an awaited condition
 _TAKE_OFF_TIMEOUT = 240.0  # s; vehicles take off one after another
 _LAND_TIMEOUT = 120.0  # s
 

@@ -1,4 +1,4 @@
-"""A flight in progress as who steers it sees it: by processes in real time, or on a stepped clock."""
+"""The interface of a flight in progress to the program that steers it: in real time, or on a stepped clock."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from cfplan.flight.telemetry import Telemetry, Triple
 
 @dataclass(frozen=True, slots=True)
 class Listeners:
-    """Who hears of a flight; called from any thread, one after the other."""
+    """The listeners of a flight; called from any thread, one after the other."""
 
     telemetry: Callable[[Telemetry], None]
     answer: Callable[[PathAnswer], None]
@@ -53,4 +53,4 @@ class FlightInProgress(Protocol):
         """
 
     def close(self) -> None:
-        """Release the vehicle; a flight that goes on is landed first. May be called twice."""
+        """Release the vehicle; a flight in progress is landed first. May be called twice."""

@@ -176,7 +176,7 @@ def _fault(error: BaseException) -> CfplanError:
 def main_module_hidden() -> Iterator[None]:
     """Start processes without the program's own module in them: else they would run it again, and steer too.
 
-    That is so wherever a program has no `if __name__ == "__main__"`.
+    This concerns programs without `if __name__ == "__main__"`.
     """
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")

@@ -127,7 +127,7 @@ def _beginning(record: Record, plans: list[Plan | None]) -> tuple[Timeline, Plan
 
 
 def _jump(timeline: Timeline, joint: float, plan: Plan) -> float:
-    """Return by how much position to jerk jump at a joint, s. Raises NotCertifiedError if they do."""
+    """Return the largest jump, of position to jerk, at a joint, s. Raises NotCertifiedError if there is one."""
     before, after = timeline.motion.at(joint), plan.trajectory.at(0.0)
     jumps = [
         float(np.abs(getattr(after, name) - getattr(before, name)).max())

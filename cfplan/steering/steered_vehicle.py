@@ -1,9 +1,9 @@
 """A vehicle that a program steers: take off, fly through waypoints, change them in the air, land.
 
-Whatever the program requests, and even if it dies, the vehicle is committed to setpoints that end in a hover inside the
-space, each with a stop. A request is planned during the flight, certified like a plan before take-off, and flown from a
-joint ahead of the vehicle without a stop between; if that is impossible, it is refused with a reason and the flight
-continues unchanged.
+For any requests of the program, and even if it dies, the vehicle is committed to setpoints that end in a hover inside
+the space, each with a stop. A request is planned during the flight, certified like a plan before take-off, and flown
+from a joint ahead of the vehicle without a stop between; if that is impossible, it is refused with a reason and the
+flight continues unchanged.
 """
 
 import math
@@ -38,7 +38,7 @@ from cfplan.safety.limits import Limits
 from cfplan.steering.flight_in_progress import FlightInProgress, Listeners
 from cfplan.steering.recorded_steering import SteeringRecord, answer_text
 
-MOST_WAYPOINTS = 200  # per request
+MAX_WAYPOINTS = 200  # per request
 _TAKE_OFF_TIMEOUT = 120.0  # s, preflight and its waits included
 PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which the planner counts as not answering
 _LAND_TIMEOUT = 120.0  # s
@@ -358,9 +358,9 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
         raise InputError("these are not numbers", where="waypoints", hint=hint) from None
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
         raise InputError(f"waypoints of shape {points.shape}", where="waypoints", hint=hint)
-    if len(points) > MOST_WAYPOINTS:
+    if len(points) > MAX_WAYPOINTS:
         raise InputError(
-            f"{len(points)} waypoints at once", where="waypoints", hint=f"give at most {MOST_WAYPOINTS}, and extend"
+            f"{len(points)} waypoints at once", where="waypoints", hint=f"give at most {MAX_WAYPOINTS}, and extend"
         )
     far = ~(np.abs(points) <= MAX_COORDINATE).all(axis=1)  # NaN too
     if far.any():

@@ -33,9 +33,9 @@ from cfplan.steering.steered_vehicle import SteeredVehicle, checked_waypoints
 
 STANDARD_INPUT = "-"
 SOCKET = "unix:"  # before the path of a socket
-MOST_TOGETHER = 20  # waiting waypoints that are planned as one request
-MOST_WAITING = 10_000  # lines; more are refused
-LONGEST = 10_000  # bytes of a line
+MAX_BATCH = 20  # waiting waypoints that are planned as one request
+MAX_WAITING = 10_000  # lines; more are refused
+MAX_LINE_BYTES = 10_000  # bytes of a line
 _PATIENCE = 0.1  # s
 _OWNER_ONLY = 0o177  # umask: only the owner may connect
 _HINT = "write x y z in metres, as 1.0 0.0 1.2; or replace, stop, slower, faster, land, cut"
@@ -68,7 +68,7 @@ class LineSource(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _LineRequest:
     """A line's request."""
 
     line: TextLine
@@ -111,7 +111,7 @@ def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
     At the end of the lines the vehicle first flies all requests. Orders are not given here: their source passes them to
     the pilot. Raises FlightEndedError if a safety rule or the operator's keys ended the flight.
     """
-    waiting: list[_Asked] = []
+    waiting: list[_LineRequest] = []
     try:
         _ask_until_the_end(vehicle, lines, waiting)
     except FlightEndedError:
@@ -124,7 +124,7 @@ def steer_by_lines(vehicle: SteeredVehicle, lines: LineSource) -> None:
     vehicle.finish()
 
 
-def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list[_Asked]) -> None:
+def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list[_LineRequest]) -> None:
     """Make the requests in lines until the lines or the flight end; those that are `waiting` are made together."""
     while not lines.ending:
         if vehicle.outcome is not None:
@@ -136,7 +136,7 @@ def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list
             _ask_all(vehicle, lines, waiting)
             return
         asked = _read(line) if line is not None else None
-        if asked is not None and asked.wish is Wish.EXTEND and len(waiting) < MOST_TOGETHER:
+        if asked is not None and asked.wish is Wish.EXTEND and len(waiting) < MAX_BATCH:
             waiting.append(asked)
             continue
         try:
@@ -148,15 +148,15 @@ def _ask_until_the_end(vehicle: SteeredVehicle, lines: LineSource, waiting: list
             _ask_all(vehicle, lines, waiting)
 
 
-def _read(line: TextLine) -> _Asked | None:
+def _read(line: TextLine) -> _LineRequest | None:
     try:
-        return _Asked(line, *parse_line(line.text))
+        return _LineRequest(line, *parse_line(line.text))
     except InputError as error:
         line.answer(f"refused: {error}")
         return None
 
 
-def _ask_all(vehicle: SteeredVehicle, lines: LineSource, asked: list[_Asked]) -> None:
+def _ask_all(vehicle: SteeredVehicle, lines: LineSource, asked: list[_LineRequest]) -> None:
     """Make the requests of lines together; if that is refused, one by one, so that each line has its answer.
 
     Answered lines are removed from the list. After an order no request is made.
@@ -172,7 +172,7 @@ def _ask_all(vehicle: SteeredVehicle, lines: LineSource, asked: list[_Asked]) ->
         del asked[0]
 
 
-def _answer_alone(vehicle: SteeredVehicle, asked: _Asked) -> str:
+def _answer_alone(vehicle: SteeredVehicle, asked: _LineRequest) -> str:
     try:
         return answer_text(vehicle.ask(asked.wish, asked.waypoints))
     except (RequestRefusedError, InputError) as error:
@@ -190,7 +190,7 @@ class QueuedLines:
     """Lines that threads read; a LineSource. Orders among them do not wait: `orders` returns them at once."""
 
     def __init__(self) -> None:
-        self._queue: queue.Queue[TextLine | None] = queue.Queue(MOST_WAITING)
+        self._queue: queue.Queue[TextLine | None] = queue.Queue(MAX_WAITING)
         self._orders: deque[Order] = deque()
         self._number = 0
         self.ending = False
@@ -221,21 +221,23 @@ class QueuedLines:
             self.ending = True
             line.answer(f"accepted: {order.name.lower()}")
             return
-        if len(content) >= LONGEST:
-            line.answer(f"refused: longer than {LONGEST} bytes")
+        if len(content) >= MAX_LINE_BYTES:
+            line.answer(f"refused: longer than {MAX_LINE_BYTES} bytes")
             return
         try:
             self._queue.put_nowait(line)
         except queue.Full:
-            line.answer(f"refused: {MOST_WAITING} lines wait already")
+            line.answer(f"refused: {MAX_WAITING} lines wait already")
 
     def read(self, stream: IO[bytes], reply: Callable[[str], None]) -> None:
         """Take a stream's lines until it ends or breaks."""
         with contextlib.suppress(OSError, ValueError):
-            while line := stream.readline(LONGEST):
+            while line := stream.readline(MAX_LINE_BYTES):
                 rest = line
-                while len(rest) == LONGEST and not rest.endswith(b"\n"):  # skip the rest of a line that is too long
-                    rest = stream.readline(LONGEST)
+                while len(rest) == MAX_LINE_BYTES and not rest.endswith(
+                    b"\n"
+                ):  # skip the rest of a line that is too long
+                    rest = stream.readline(MAX_LINE_BYTES)
                 self.take(line, reply)
 
     def end(self) -> None:

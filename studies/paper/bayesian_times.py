@@ -27,7 +27,7 @@ from cfplan.errors import InfeasibleError, InputError
 from studies.paper.classifier import fit
 
 Check = Callable[[NDArray], bool]  # whether a motion with these segment times, (S,) s, passes
-LEAST, MOST = 0.1, 1.9  # range of factors on the nominal times
+MIN_FACTOR, MAX_FACTOR = 0.1, 1.9  # range of factors on the nominal times
 SPREAD = 0.2  # standard deviation of the factors of cheap samples drawn around the nominal times, half of all
 STEPS = 14  # of the bisection for the fastest uniform timing
 CANDIDATES = 1024  # candidates of each step
@@ -94,7 +94,9 @@ def optimise_times(
     _ask_both_kinds(cheap, budget.low, random)
     for step in range(budget.high // 2):  # uniform timings, slower and faster in turn
         for sign in (1.0, -1.0):
-            dear.ask(np.full(len(nominal), 1.0 + sign * step * 2.0 * (MOST - 1.0) / budget.high - (sign < 0) * 0.05))
+            dear.ask(
+                np.full(len(nominal), 1.0 + sign * step * 2.0 * (MAX_FACTOR - 1.0) / budget.high - (sign < 0) * 0.05)
+            )
     best = np.ones(len(nominal))
     some = random.permutation(len(cheap.passed))[:SHAPED]
     shaped = _fitted(cheap.factors[some], cheap.passed[some])
@@ -137,8 +139,8 @@ def _ask_both_kinds(samples: _Samples, count: int, random: np.random.Generator) 
     size, batch = samples.nominal.size, max(count // 10, 1)
     kept: dict[bool, list[NDArray]] = {True: [], False: []}
     for _ in range(100):
-        even = LEAST + (MOST - LEAST) * qmc.LatinHypercube(size, rng=random).random(batch)
-        about = np.clip(random.normal(1.0, SPREAD, (batch, size)), LEAST, MOST)
+        even = MIN_FACTOR + (MAX_FACTOR - MIN_FACTOR) * qmc.LatinHypercube(size, rng=random).random(batch)
+        about = np.clip(random.normal(1.0, SPREAD, (batch, size)), MIN_FACTOR, MAX_FACTOR)
         for factors in np.concatenate([even, about]):
             kept[samples._answer(factors * samples.nominal)].append(factors)
         if min(map(len, kept.values())) >= count // 2:
@@ -152,7 +154,7 @@ def _about(best: NDArray, random: np.random.Generator) -> NDArray:
     """Return candidates, (at most CANDIDATES, S), around the best factors, near and far."""
     spread = np.exp(random.uniform(np.log(NEAR), np.log(FAR), (CANDIDATES, 1)))
     drawn = best * (1.0 + spread * random.normal(size=(CANDIDATES, len(best))))
-    return np.asarray(drawn[((drawn >= LEAST) & (drawn <= MOST)).all(axis=1)])
+    return np.asarray(drawn[((drawn >= MIN_FACTOR) & (drawn <= MAX_FACTOR)).all(axis=1)])
 
 
 def _next(

@@ -47,7 +47,7 @@ SIZES = MappingProxyType({
     Kind.NEIGHBOURS: Size(192, 3), Kind.BIDIRECTIONAL: Size(64, 2),
 })  # fmt: skip
 HEADS = 4
-MOST_LOG = 10.0  # bound of |log h|: larger values are failures of the network
+MAX_LOG = 10.0  # bound of |log h|: larger values are failures of the network
 
 
 class SequenceNetwork(nn.Module, ABC):
@@ -71,7 +71,7 @@ class SequenceNetwork(nn.Module, ABC):
         seen = (inputs - self.mean) / self.scale
         fed = None if answers is None else self.scaled(answers)
         found = self.middle + self.spread * self.answer(seen, fed)
-        return torch.stack([found[..., 0].clamp(-MOST_LOG, MOST_LOG).exp(), found[..., 1]], -1)
+        return torch.stack([found[..., 0].clamp(-MAX_LOG, MAX_LOG).exp(), found[..., 1]], -1)
 
     def scaled(self, answers: Tensor) -> Tensor:
         """Return answers in normalised form, in which the loss is computed."""
@@ -216,7 +216,7 @@ def build_network(kind: Kind, inputs: int, size: Size | None = None) -> Sequence
 
 
 def _with_logarithm(answers: Tensor) -> Tensor:
-    return torch.stack([answers[..., 0].clamp_min(math.exp(-MOST_LOG)).log(), answers[..., 1]], -1)
+    return torch.stack([answers[..., 0].clamp_min(math.exp(-MAX_LOG)).log(), answers[..., 1]], -1)
 
 
 def placed(values: Tensor) -> Tensor:

@@ -17,7 +17,7 @@ SCALES = (0.0, 0.001, 0.01, 0.1)  # m
 TOLERANCE = (0.02, 0.1)  # m and m/s, times a factor: within it a planned state counts as reached
 FACTORS = (0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0)
 SHOWN_FACTORS = (1.0, 2.5, 5.0)
-CLEAN = ("LSTM", 0.001)  # model and ε, m, whose printed in-BRT probability tells the paper's tolerance
+CLEAN = ("LSTM", 0.001)  # model and ε, m, whose printed in-BRT probability determines the paper's tolerance
 SHIPPED = "the shipped planner, certified"  # yaw is free, as in the paper
 SHIPPED_FIXED, SHIPPED_TANGENT = HELD_YAW = ("the shipped planner, yaw fixed", "the shipped planner, yaw tangent")
 

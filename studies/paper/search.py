@@ -1,7 +1,7 @@
 """Search learning rate and width of each of the paper's architectures, with the same budget for each.
 
 Every candidate is trained by a short rule, until its validation loss is nearly flat. The least validation loss of an
-architecture tells the rate and the width with which its networks are trained.
+architecture determines the rate and the width with which its networks are trained.
 """
 
 from collections.abc import Iterator

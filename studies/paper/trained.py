@@ -50,7 +50,7 @@ class NetworkSettings:
 
 @dataclass(frozen=True, slots=True)
 class TrainedNetwork:
-    """A network ready to be asked."""
+    """A network ready for evaluation."""
 
     name: str
     options: SequenceOptions
@@ -111,7 +111,7 @@ class PaperPath(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PaperData:
-    """The paths of a study, and the networks that it asks."""
+    """The paths of a study, and the networks that it evaluates."""
 
     paths: dict[str, PaperPath]  # by case name: first TRAIN, then TEST
     networks: list[TrainedNetwork]

@@ -1,9 +1,9 @@
 """Train the paper's networks until their validation loss is flat, one folder each; training is resumable.
 
-Transformer and MLPs learn by teacher forcing, on which the paper's explanation of their failures rests. The LSTM, which
-according to the paper is fed its own answers, is fed those that it gives at that moment; gradients do not pass through
-them. Noise injection follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As
-an option that is not in the paper, perturbed paths are solved again.
+Transformer and MLPs learn by teacher forcing, as the paper's explanation of their failures assumes. The LSTM, which is
+fed its own answers according to the paper, is fed its current ones; gradients do not pass through them. Noise injection
+follows the paper: half of the paths of an epoch are perturbed and keep the clean path's label. As an option that is not
+in the paper, perturbed paths are solved again.
 """
 
 import json
@@ -34,13 +34,13 @@ WARM_UP = 200  # steps over which the learning rate rises at first
 CLIP = 1.0  # largest norm of the gradient
 YAW = 0.01  # weight of the squared error of cos ψ relative to that of log h, both normalised
 NOISE_EPOCHS = 5  # epochs between new perturbations
-UNSEEN_SHARE = 0.05  # fraction of the paths on which each epoch is validated
+UNSEEN_FRACTION = 0.05  # fraction of the paths on which each epoch is validated
 FEATURES = "paper 1"  # version of the networks' inputs, and of what they are validated by
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UntilFlat:
-    """When a training ends: once its validation loss is flat at every learning rate.
+    """The stopping rule of a training: its validation loss is flat at every learning rate.
 
     The loss is flat after `patience` epochs in which it stayed above (1 - `improvement`) of the least until then. The
     learning rate is then multiplied by `factor`, `cuts` times; when the loss is flat once more, the training ends. Its
@@ -71,7 +71,7 @@ class UntilFlat:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Training:
-    """What is known of a finished training."""
+    """The figures of a finished training."""
 
     epochs: int
     best: int  # epoch with the least validation loss, whose network is kept
@@ -218,7 +218,7 @@ def _identity(sequences: Sequences, options: SequenceOptions) -> dict[str, Any]:
 def _split(sequences: Sequences, seed: int) -> tuple[Sequences, Sequences]:
     """Return the validation set and the training set."""
     order = np.random.default_rng([seed, 0]).permutation(len(sequences.rows))
-    count = max(1, round(UNSEEN_SHARE * len(order)))
+    count = max(1, round(UNSEEN_FRACTION * len(order)))
     return sequences.part(np.sort(order[:count])), sequences.part(np.sort(order[count:]))
 
 
@@ -265,7 +265,7 @@ def _run_epoch(
 
 
 def _fed(network: SequenceNetwork, seen: Tensor, answers: Tensor, options: SequenceOptions) -> Tensor:
-    """Return what a network is fed as its previous answers: the true ones, or its own at this moment."""
+    """Return the previous answers that a network is fed: the true ones, or its own at this moment."""
     if options.kind is not Kind.LSTM:
         return answers
     with torch.no_grad():

@@ -31,7 +31,7 @@ class Work:
     cases: Mapping[str, Any]  # by name
     measure: Callable[[Any], Any]  # case → a row, or a list of rows; both picklable
     row: Callable[..., Any] = dict  # rebuilds a row from its fields: the row's dataclass
-    identity: Mapping[str, Any] = field(default_factory=dict)  # what the rows depend on besides settings and sources
+    identity: Mapping[str, Any] = field(default_factory=dict)  # dependencies of rows besides settings, sources
 
 
 @dataclass(frozen=True, slots=True)

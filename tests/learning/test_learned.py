@@ -13,7 +13,7 @@ from cfplan.geometry.min_snap import min_snap
 from cfplan.geometry.yaw import YawMode
 from cfplan.learning import learned
 from cfplan.learning.features import COLUMNS, REFERENCE, scaled_limits, start_features, start_logs
-from cfplan.learning.learned import Question, plan_learned, predict
+from cfplan.learning.learned import Query, plan_learned, predict
 from cfplan.learning.windows import window_starts
 from cfplan.planners.solution import Status
 from cfplan.planners.task import PlanningTask
@@ -119,10 +119,10 @@ def test_a_grid_finer_than_the_network_needs_has_the_same_motion(model):
 
 def test_many_paths_at_once_are_each_as_alone(model):
     known = scaled_limits(CHOSEN.airframe, CHOSEN.limits)
-    asked = [Question(long_path(turns), known, nodes) for turns, nodes in ((4, 30), (9, 60), (5, 100))]
+    asked = [Query(long_path(turns), known, nodes) for turns, nodes in ((4, 30), (9, 60), (5, 100))]
     together = predict(asked, model.network, model.window)
-    for question, found in zip(asked, together, strict=True):
-        (alone,) = predict([question], model.network, model.window)
+    for query, found in zip(asked, together, strict=True):
+        (alone,) = predict([query], model.network, model.window)
         np.testing.assert_allclose(found.coefficients, alone.coefficients, rtol=1e-5)
         np.testing.assert_allclose(found.yaw, alone.yaw, atol=1e-5)
 
@@ -177,7 +177,7 @@ def test_limits_and_vehicle_scale_the_proposal(model):
     )
     path = min_snap(4.0 * PATH(PATH.breaks))
     here, there = (
-        predict([Question(each, scaled_limits(*who), 100)], model.network, model.window)[0].coefficients
+        predict([Query(each, scaled_limits(*who), 100)], model.network, model.window)[0].coefficients
         for each, who in ((PATH, (airframe, limits)), (path, (vehicle, larger)))
     )
     # s is four times as long and time twice: h = (ds/dt)² is four times
@@ -194,7 +194,7 @@ def test_work_grows_with_the_path_and_no_faster(model):
             calls.append(inputs.shape)
             return model.network(inputs)
 
-        predict([Question(long_path(12), scaled_limits(CHOSEN.airframe, CHOSEN.limits), nodes)], counting, model.window)
+        predict([Query(long_path(12), scaled_limits(CHOSEN.airframe, CHOSEN.limits), nodes)], counting, model.window)
         ((windows, count, _),) = calls
         assert count == model.window + 1
         counts.append(windows)

@@ -23,8 +23,8 @@ from cfplan.flight.pilot.keys import Order
 from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import (
-    LONGEST,
-    MOST_WAITING,
+    MAX_LINE_BYTES,
+    MAX_WAITING,
     QueuedLines,
     TextLine,
     opened_lines,
@@ -231,17 +231,17 @@ def test_a_second_client_is_refused_and_one_that_vanishes_makes_room(place):
 
 def test_an_order_is_read_though_nobody_takes_lines_or_reads_answers(place):
     with opened_lines(place, print) as lines, connected() as client:
-        client.sendall(b"1 0 1\n" * (MOST_WAITING + 20_000) + b"land\n")
+        client.sendall(b"1 0 1\n" * (MAX_WAITING + 20_000) + b"land\n")
         assert until(lambda: lines.ending)
         assert list(lines.orders()) == [Order.LAND]
-        assert client.recv(100).startswith(f"{MOST_WAITING + 1} refused: {MOST_WAITING} lines wait".encode())
+        assert client.recv(100).startswith(f"{MAX_WAITING + 1} refused: {MAX_WAITING} lines wait".encode())
 
 
 def test_a_line_that_is_too_long_is_refused_whole_and_the_next_one_counts(place):
     with opened_lines(place, print) as lines, connected() as client:
-        client.sendall(b"replace " + b"1 0 1 " * LONGEST + b"\n0 1 1\n")
+        client.sendall(b"replace " + b"1 0 1 " * MAX_LINE_BYTES + b"\n0 1 1\n")
         assert lines.next(60.0).text == "0 1 1\n"
-        assert client.recv(100) == f"1 refused: longer than {LONGEST} bytes\n".encode()
+        assert client.recv(100) == f"1 refused: longer than {MAX_LINE_BYTES} bytes\n".encode()
 
 
 def test_nobody_else_may_connect_and_no_port_is_open(place):

@@ -1,10 +1,10 @@
 """Convex time-optimal path parameterisation (TOPP): a proven lower bound on the time of flight, and a planner.
 
 With speed, acceleration and collective thrust as the only limits, and no attitude, the problem is convex in
-b = (ds/dt)² by arc length and is solved by reachability analysis (copp-py). From outside, its polygons and its steps
-only ever allow more than a flight may do, so its time is a lower bound; from inside, it gives a profile that is
-smoothed to be flyable. It knows nothing of motors and body rates: where the acceleration jumps the profile breaks their
-limits, and is as slow after repair as that costs.
+b = (ds/dt)² by arc length and is solved by reachability analysis (copp-py). The outer approximation relaxes every
+limit, so its time is a lower bound; the inner approximation tightens them, and its profile is smoothed to be flyable.
+The problem ignores motors and body rates: where the acceleration jumps the profile exceeds their limits, and repair
+slows it down.
 """
 
 import time
@@ -28,20 +28,20 @@ from cfplan.safety.speed_caps import allowed_speed
 from cfplan.vehicle.airframe import Airframe
 from cfplan.vehicle.yaw_spline import YawSpline
 
-# Between stations, m and rad: what discretisation costs the bound falls with both, to 0.3 % of time at 2 m/s
+# Between stations, m and rad: the bound's discretisation error falls with both, to 0.3 % of time at 2 m/s
 BOUND_SPACING, BOUND_TURN = 0.005, 0.004
-PLAN_SPACING, PLAN_TURN = 0.03, 0.03  # coarser, as what the planner makes of it is certified and not proven
-# Of the width at which a jump of acceleration takes the whole of a limit; wider rounds tight corners off too much
-WINDOW_SHARES = (0.25, 0.5, 1.0)
-BOUNDARY_SLACK = 1.01  # on b where a segment hands over: what is on a limit from inside may be over the polygon's
+PLAN_SPACING, PLAN_TURN = 0.03, 0.03  # coarser: the planner's profile is certified, not proven
+# Of the window width at which a jump of acceleration uses up a limit; wider windows round off tight corners too much
+WINDOW_FRACTIONS = (0.25, 0.5, 1.0)
+BOUNDARY_SLACK = 1.01  # factor on b in a boundary state: a state that keeps a limit may lie outside the inner polygon
 Boundary = tuple[float | None, float | None]  # m²/s² at the start and the end of the path, None where it is free
 
 
 def lower_bound(task: PlanningTask) -> float:
-    """Return the time, s, below which no motion keeps the limits of speed, acceleration and collective thrust.
+    """Return a lower bound, s, on the time of a motion within the limits of speed, acceleration and collective thrust.
 
-    What is proven: a feasible motion sampled at the stations meets every row (`outer_rows`), so at each station it is
-    no faster than the reachable set's top; between two stations it cannot exceed what full acceleration from both
+    The bound is proven: a feasible motion sampled at the stations meets every row (`outer_rows`), so at each station it
+    is no faster than the reachable set's top; between two stations it cannot exceed what full acceleration from both
     gives. Curvature and slope are bounded over each interval by their extremes at its samples, not by interval
     arithmetic.
 
@@ -54,7 +54,7 @@ def lower_bound(task: PlanningTask) -> float:
 
 
 def _outer_top(at: Stations, airframe: Airframe, limits: PlanLimits, boundary: Boundary) -> NDArray:
-    """Return (M,) m²/s², the most that b can be at the stations.
+    """Return (M,) m²/s², an upper bound on b at the stations.
 
     The second pass bounds drag by the speeds that the first allows.
     """
@@ -64,7 +64,7 @@ def _outer_top(at: Stations, airframe: Airframe, limits: PlanLimits, boundary: B
 
 
 def _fastest(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
-    """Return (M,) m/s, above which no speed can be in the two intervals beside each station."""
+    """Return (M,) m/s, an upper bound on speed in the two intervals beside each station."""
     spacing = np.diff(at.length)
     inside = np.maximum(top[:-1], top[1:]) + 2 * limits.acceleration * spacing
     around = np.maximum(np.append(inside, inside[-1]), np.insert(inside, 0, inside[0]))
@@ -72,7 +72,7 @@ def _fastest(at: Stations, top: NDArray, limits: PlanLimits) -> NDArray:
 
 
 def plan_convex(task: PlanningTask) -> Solution:
-    """Solve the convex problem from inside and smooth it. Of a boundary state only h is met, and only roughly."""
+    """Solve the inner approximation and smooth it. Of a boundary state only h is met, and only approximately."""
     begun = time.perf_counter()
     airframe, limits, boundary = task.airframe, task.limits, _boundary(task)
     at = stations(task.path, spacing=PLAN_SPACING, turn=PLAN_TURN)
@@ -85,7 +85,9 @@ def plan_convex(task: PlanningTask) -> Solution:
         return Solution(Status.INFEASIBLE, None, str(error))
     along = YawSpline.along(task.path, task.nodes, task.yaw, task.yaw_angle)
     width = smoothing_half_width(airframe, limits)
-    profiles = (smooth_profile(task.path, at, speeds, share * width, task.nodes, along) for share in WINDOW_SHARES)
+    profiles = (
+        smooth_profile(task.path, at, speeds, fraction * width, task.nodes, along) for fraction in WINDOW_FRACTIONS
+    )
     profile = select_fastest(task, (profile for profile in profiles if profile is not None))
     stats: dict[str, float | int | str] = {
         "solver": "copp-py",
@@ -109,7 +111,7 @@ def _boundary(task: PlanningTask) -> Boundary:
 def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
     ceiling, most, ends = rows.ceiling.copy(), rows.most.copy(), []
     for index, beside, value in ((0, 1, boundary[0]), (-1, -2, boundary[1])):
-        if value is None:  # free: let b jump in the interval at that end, which only ever allows more
+        if value is None:  # free: let b jump in the interval at that end, which only relaxes the problem
             most[[index, beside]] = 1e6
             value = ceiling[index]
         elif value > ceiling[index] * BOUNDARY_SLACK:
@@ -119,7 +121,7 @@ def _problem(at: Stations, rows: Rows, boundary: Boundary) -> Any:
                 where="start of the path",
                 hint="start slower, or loosen the limits",
             )
-        ceiling[index] = max(value, 1e-9)  # the library wants it positive
+        ceiling[index] = max(value, 1e-9)  # the library requires a positive value
         ends.append(float(value))
     constraints = copp_py.constraints.Constraints(3, capacity=len(at.length))
     constraints.append_s(at.length)

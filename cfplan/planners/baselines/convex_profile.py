@@ -1,7 +1,7 @@
 """Smooth the convex problem's bang-bang speed into a profile that a vehicle can follow.
 
-The time law of the distance flown, l(t), is averaged over a triangular window in time. That keeps its speed limit,
-bounds jerk and snap where acceleration jumps, and from rest makes l grow as t⁴: just what a finite h does at a rest
+The time law of the distance flown, l(t), is averaged over a triangular window in time. That keeps the speed limit,
+bounds jerk and snap where acceleration jumps, and makes l grow as t⁴ from rest, as it does with a finite h at a rest
 end of a path, where l grows as s⁴.
 """
 
@@ -17,7 +17,8 @@ from cfplan.vehicle.yaw_spline import YawSpline
 SAMPLES_PER_INTERVAL = 8
 TIME_STEPS_PER_WINDOW = 200
 H_STIFFNESS = 1e-4
-WINDOW_RANGE = (1e-4, 50.0)  # of half the window's width, in flights: narrower costs gigabytes, wider leaves no speed
+# Half the window's width over the duration of the flight: narrower takes gigabytes, wider leaves no speed
+WINDOW_RANGE = (1e-4, 50.0)
 
 
 def smooth_profile(
@@ -43,7 +44,7 @@ def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, 
     """Return distance, m, and speed, m/s, at close times after averaging speed over the triangular window."""
     speed = np.sqrt(np.maximum(b, 0.0))
     duration = np.concatenate([[0.0], np.cumsum(2 * np.diff(length) / (speed[1:] + speed[:-1]))])
-    half_width = float(np.clip(half_width, *(share * duration[-1] for share in WINDOW_RANGE)))
+    half_width = float(np.clip(half_width, *(fraction * duration[-1] for fraction in WINDOW_RANGE)))
     step = half_width / TIME_STEPS_PER_WINDOW
     time = np.arange(-TIME_STEPS_PER_WINDOW, int(np.ceil(duration[-1] / step)) + TIME_STEPS_PER_WINDOW + 1) * step
     law = np.interp(time, duration, speed)  # acceleration is constant between stations: speed is linear in time
@@ -52,11 +53,11 @@ def _averaged(length: NDArray, b: NDArray, half_width: float) -> tuple[NDArray, 
         total = np.concatenate([[0.0], np.cumsum(smooth)])
         smooth = (total[TIME_STEPS_PER_WINDOW:] - total[:-TIME_STEPS_PER_WINDOW]) / TIME_STEPS_PER_WINDOW
     gone = np.concatenate([[0.0], np.cumsum(0.5 * (smooth[1:] + smooth[:-1])) * step])
-    gone -= half_width * speed[0]  # a flight that does not start from rest was on its way before
+    gone -= half_width * speed[0]  # a flight that starts in motion was already under way
     return gone * (length[-1] + half_width * speed[-1]) / gone[-1], smooth
 
 
 def _graded(distance: NDArray, total: float) -> NDArray:
-    """Return distance so stretched that a rest end, where it grows as s⁴ and as t⁴, looks linear in s and in t."""
+    """Return distance stretched so that a rest end, where it grows as s⁴ and as t⁴, looks linear in s and in t."""
     half, inside = total / 2, np.clip(distance, 0.0, total)
     return np.where(inside < half, inside**0.25, 2 * half**0.25 - (total - inside) ** 0.25)

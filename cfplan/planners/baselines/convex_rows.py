@@ -5,9 +5,9 @@ With x the direction of flight and y that of the curvature vector, the limits ar
     (½b')² + (κb)² ≤ a_max²
     (½b' + g e₃·T + d√b)² + (κb + g e₃·N)² + (g e₃·B)² ≤ F²,   F = 4 u_max/m + c√b
 
-with d the drag in the rotor plane over mass and c what drag along the thrust axis differs by, as flatness has it.
-√b is concave: where b is at most w² it lies over its chord b/w and under its tangent (b + w²)/(2w), so both signs stay
-linear, and tight where w, the `fastest` speed known to be possible around a station, is.
+with d the drag in the rotor plane over mass and c the difference of drag along the thrust axis, as in flatness.
+√b is concave: for b ≤ w² it lies above its chord b/w and below its tangent (b + w²)/(2w). The rows are therefore linear
+for drag of either sign, and tight if w, the upper bound `fastest` on speed around a station, is tight.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ class Rows:
 
 
 def outer_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: NDArray) -> Rows:
-    """Return rows that every feasible motion meets, also with ½b' its mean over either interval beside the station.
+    """Return rows that every feasible motion meets, also if ½b' is its mean over either interval beside the station.
 
     A limit holds for the mean of a motion over an interval as it does at each of its points, because discs are
     convex. The mean of b there is within a_max Δ of b at the station because |½b'| ≤ a_max; curvature and the frame
@@ -73,7 +73,7 @@ def outer_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: ND
 
 
 def inner_rows(at: Stations, airframe: Airframe, limits: PlanLimits, fastest: NDArray) -> Rows:
-    """Return rows that allow no more than the limits do at the stations, where speed is at most `fastest`, (M,) m/s."""
+    """Return rows that imply the limits at the stations, where speed is at most `fastest`, (M,) m/s."""
     x, y = _directions()
     w = fastest[:, None]
     inside = np.cos(np.pi / DIRECTIONS)
@@ -115,6 +115,6 @@ def _directions() -> tuple[NDArray, NDArray]:
 
 
 def _drag(airframe: Airframe) -> tuple[float, float]:
-    """Return, 1/s, drag in the rotor plane over mass, and by how much drag along the thrust axis differs."""
+    """Return drag in the rotor plane over mass, and the difference of drag along the thrust axis from it, 1/s."""
     plane, axial = airframe.drag
     return plane / airframe.mass, abs(axial - plane) / airframe.mass

@@ -2,7 +2,7 @@
 
 By arc length l the motion is v = √b T and a = ½b' T + b k with the curvature vector k = κN, so every limit on the
 norm of a, or of a + g e₃, lies in the plane of T and N. At a rest end γ' vanishes and h may grow without bound while
-b = |γ'|²h stays what it is: that is why nothing here is in cfplan's own parameter s.
+b = |γ'|²h stays bounded: hence nothing here is in cfplan's own parameter s.
 """
 
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from cfplan.geometry.path import Path
 
 SAMPLES_PER_STATION = 5  # fine samples between stations at nominal speed, 1 m/s
 SAMPLES_MIN, SAMPLES_MAX = 2_000, 500_000
-MOST = 25_000  # stations: they take some 8 kB each, and as much time; a path with more has them further apart
+MAX_STATIONS = 25_000  # each takes some 8 kB, and time in proportion; longer paths have them further apart
 STATION_GROWTH = 0.05  # of the distance from the path's nearer end: curvature is unbounded at a rest end
 FIRST_STATION = 1e-5  # m from an end
-SWING = 0.2  # of e₃·N around a station: more than that and samples do not bound it
+SWING = 0.2  # change of e₃·N around a station, above which samples do not bound it
 
 
 @dataclass(frozen=True, slots=True)
 class Stations:
-    """What holds around each of M stations. low and high bound it over both intervals that touch the station."""
+    """Geometry at each of M stations. low and high bound it over both intervals that touch the station."""
 
     length: NDArray  # (M,) m along the path, from 0
     s: NDArray  # (M,)
@@ -42,7 +42,7 @@ class Stations:
 def stations(path: Path, *, spacing: float, turn: float) -> Stations:
     """Return stations at most `spacing`, m, and `turn`, rad of direction, apart; closer towards the path's ends.
 
-    Where that were more than MOST, all are further apart by the same factor.
+    If that took more than MAX_STATIONS, all are further apart by the same factor.
     """
     samples = int(np.clip(SAMPLES_PER_STATION * path.end / spacing, SAMPLES_MIN, SAMPLES_MAX))
     # Graded towards both ends, so that a rest end's first micrometres are resolved.
@@ -55,7 +55,7 @@ def stations(path: Path, *, spacing: float, turn: float) -> Stations:
     density = np.maximum(1 / spacing, 1 / (STATION_GROWTH * distance))
     density = np.maximum(density, np.minimum(curvature, 1 / distance) / turn)
     count = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(length))])
-    wanted = np.linspace(0.0, count[-1], min(int(np.ceil(count[-1])), MOST) + 1)
+    wanted = np.linspace(0.0, count[-1], min(int(np.ceil(count[-1])), MAX_STATIONS) + 1)
     chosen = np.unique(np.concatenate([[0], np.searchsorted(count, wanted[1:-1]), [samples]]))
     binormal_square = np.clip(1.0 - slope**2 - normal**2, 0.0, 1.0)
 

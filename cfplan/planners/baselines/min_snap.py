@@ -1,4 +1,4 @@
-"""The min-snap baseline: the path at its nominal timing, scaled as a whole until it is certified."""
+"""The min-snap baseline: the path at its nominal timing, slowed or sped up uniformly until it is certified."""
 
 import time
 
@@ -16,7 +16,7 @@ SAMPLES_PER_UNIT = 200  # of s, where the greatest nominal speed is sought
 
 
 def plan_min_snap(task: PlanningTask) -> Solution:
-    """Plan h constant, as great as the certificate allows. Boundary states are not met: h would have to be theirs."""
+    """Plan the largest constant h that the certificate allows. Boundary states are not met: they prescribe h."""
     begun = time.perf_counter()
     path, airframe, limits, nodes = task.path, task.airframe, task.limits, task.nodes
     grid = np.linspace(0.0, path.end, nodes + 1)

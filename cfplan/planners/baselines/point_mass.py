@@ -23,8 +23,8 @@ def point_mass_time(
 ) -> float | None:
     """Return the least time, s, of a point mass through waypoints, (K, 3) m, from rest to rest; None if none is found.
 
-    Where there are `regions`, K of them, it passes the waypoints anywhere within these. There is no answer for more
-    than MOST_WAYPOINTS.
+    With `regions`, K of them, it may pass the waypoints anywhere within these. Also None for more than
+    MOST_WAYPOINTS.
     """
     import casadi as ca  # slow to import
 

@@ -1,4 +1,4 @@
-"""Select the fastest of several profiles, by what each loses when it is slowed to its certificate."""
+"""Select the profile that is fastest after it is slowed to meet the certificate."""
 
 from collections.abc import Iterable
 
@@ -13,7 +13,7 @@ from cfplan.vehicle.trajectory import Trajectory
 
 
 def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> SpeedProfile | None:
-    """Return the profile that is fastest once slowed as far as its certificate asks; None if none can be flown."""
+    """Return the profile that is fastest after slowing until it is certified; None if none can be flown."""
     best, least = None, np.inf
     for profile in profiles:
         try:
@@ -27,9 +27,9 @@ def select_fastest(task: PlanningTask, profiles: Iterable[SpeedProfile]) -> Spee
 
 
 def _speed_factor(certificate: Certificate) -> float:
-    """Return the factor on speed at which every limit would hold if each share grew as a power of speed."""
+    """Return the factor on speed at which every limit would hold if each usage grew as a power of speed."""
     powers = {quantity.name: quantity.power for quantity in QUANTITIES} | {CAPPED_SPEED: 1}
-    shares = [margin.share ** (1 / powers[margin.name]) for margin in certificate.margins if not margin.passed]
-    if any(np.isnan(share) for share in shares):
+    usages = [margin.share ** (1 / powers[margin.name]) for margin in certificate.margins if not margin.passed]
+    if any(np.isnan(usage) for usage in usages):
         return 0.0
-    return 1.0 / max(shares, default=1.0)
+    return 1.0 / max(usages, default=1.0)

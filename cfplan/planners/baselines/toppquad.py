@@ -1,11 +1,11 @@
-"""TOPPQuad as a planner: the paper's, with which the expert and the learned planner are compared.
+"""TOPPQuad as a planner: the paper's method, a baseline for the expert and the learned planner.
 
 K. Mao, I. Spasojevic, M. A. Hsieh, V. Kumar, "TOPPQuad: Dynamically-Feasible Time-Optimal Path Parametrization for
 Quadrotors", IROS 2024, arXiv:2309.11637; as used in K. Mao et al., "Sequence Modeling for Time-Optimal Quadrotor
 Trajectory Optimization with Sampling-based Robustness Analysis", 2025, arXiv:2506.13915, which is "the paper".
 
-Of the solver's answer only h and yaw at the grid points are kept: attitude, rates and thrusts follow from them through
-flatness, as the paper recovers them, so the solver's own values of them are dropped.
+Only h and yaw at the grid points are taken from the solution: attitude, rates and thrusts follow from them through
+flatness, as in the paper, and the solver's own values of them are dropped.
 """
 
 import time
@@ -36,27 +36,27 @@ from cfplan.vehicle.profile_spline import profile_through
 from cfplan.vehicle.rotations import hopf_quaternion, product
 from cfplan.vehicle.yaw_spline import YawSpline
 
-NODES_LEAST = 8
+MIN_NODES = 8
 MAX_ITERATIONS = 1000
 MAX_SECONDS = 30.0  # of one attempt
-# ds/dt of the min-snap timing to start from: the paper's, which solved 98 % of its paths, and one for a second attempt
+# ds/dt of the min-snap timings to start from: the paper's, which solved 98 % of its paths, and one for a second attempt
 GUESS_SPEEDS = (1.0, 0.5)
 END_NODES = 2
-END_SHARE = 0.5
-# Of the spline through h: the grid of the paper is too coarse to say how h goes on between its points
+END_USAGE = 0.5
+# Of the spline through h: the paper's grid is too coarse to determine h between its points
 H_STIFFNESSES = (1e-2, 1e-1, 1.0, 10.0, 100.0)
 YAW_STIFFNESS = 1e-2
 
 
 def plan_toppquad(task: PlanningTask, *, penalty: float = PENALTY) -> Solution:
-    """Solve the paper's problem, λ being the penalty. Free yaw, which is the paper's, starts in [0, π/2].
+    """Solve the paper's problem with λ = `penalty`. Free yaw starts in [0, π/2], as in the paper.
 
-    Of a boundary state h and h' are met, and yaw at the start: the problem's states have no more.
+    Of a boundary state, h, h' and the initial yaw are met: the problem has no further states.
     """
     path, airframe, limits, nodes = task.path, task.airframe, task.limits, task.nodes
     yaw, yaw_angle = task.yaw, task.yaw_angle
-    if nodes < NODES_LEAST:
-        return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few, take {NODES_LEAST} at least")
+    if nodes < MIN_NODES:
+        return Solution(Status.NOT_CONVERGED, None, f"{nodes} intervals are too few: use at least {MIN_NODES}")
     begun = time.process_time()
     nlp = build_toppquad(nodes + 1, airframe, limits.angular_acceleration, MAX_ITERATIONS, MAX_SECONDS, penalty)
     built = time.process_time()
@@ -71,7 +71,7 @@ def plan_toppquad(task: PlanningTask, *, penalty: float = PENALTY) -> Solution:
 
     attempts = [_solve(nlp, guesses[0], parameters, asked)]
     if not attempts[-1].solved:
-        # With yaw held the problem is far easier, and what it finds is a good guess, and no wrong answer, for free yaw.
+        # With yaw held the problem is far easier; its solution is a good guess for free yaw, and a valid answer to it.
         attempts.append(_solve(nlp, guesses[1], parameters, held))
         if attempts[-1].solved and yaw is YawMode.FREE:
             attempts.append(_solve(nlp, attempts[-1].x, parameters, asked))
@@ -123,7 +123,7 @@ def _parameters(path: Path, grid: NDArray, angles: NDArray) -> NDArray:
 
 
 def program_bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str, NDArray]:
-    """Return lbx, ubx, lbg, ubg for that way to yaw."""
+    """Return lbx, ubx, lbg, ubg for this yaw mode."""
     path, airframe, limits = task.path, task.airframe, task.limits
     count = len(grid)
     low, high = np.full((count, VARIABLES), -np.inf), np.full((count, VARIABLES), np.inf)
@@ -157,14 +157,14 @@ def program_bounds(task: PlanningTask, grid: NDArray, yaw: YawMode) -> dict[str,
 
 
 def _end_caps(path: Path, grid: NDArray, airframe: Airframe, limits: PlanLimits) -> NDArray:
-    """Return (N+1,) the most that h may be at the END_NODES grid points at each end; unbounded elsewhere.
+    """Return (N+1,), the upper bound of h at the END_NODES grid points at each end; infinite elsewhere.
 
-    Between the last two grid points of a rest end γ'' grows from nothing, so the equations at the points alone let h
+    Between the last two grid points of a rest end γ'' grows from zero, so the equations at the points alone let h
     grow without bound there. At constant h the thrust axis turns at h^(3/2) |γ'''| / g and its rate grows by
-    h² |γ''''| / g: these stay within the body rate and within a share of what motors can give beside hover.
+    h² |γ''''| / g: these stay within the body rate and within END_USAGE of the turning that motors can give.
     """
     caps = np.full(len(grid), np.inf)
-    turning = END_SHARE * min(spare_turning(airframe, limits), limits.angular_acceleration)
+    turning = END_USAGE * min(spare_turning(airframe, limits), limits.angular_acceleration)
     for ends in (range(END_NODES), range(len(grid) - END_NODES, len(grid))):
         near = np.linspace(grid[max(ends[0] - 1, 0)], grid[min(ends[-1] + 1, len(grid) - 1)], 8 * END_NODES)
         third, fourth = (float(np.linalg.norm(path(near, order), axis=1).max()) for order in (3, 4))

@@ -12,8 +12,8 @@ after Mao, Spasojevic, Hsieh and Kumar, "TOPPQuad" (IROS 2024) with the changes 
 Quadrotor Trajectory Optimization", appendix "Dataset Generation". Added here, because the certificate asks for it: the
 airframe's drag (zero drag gives back the equations above), tilt, least specific thrust and angular acceleration.
 
-Rest: at a rest end γ' = γ'' = 0, so the vehicle is level and still there for any h, and h is left free but for its
-least value. Fixing h = 0 there would leave no way out of rest, since ω is per s. Body rates at the ends are free
+Rest: at a rest end γ' = γ'' = 0, so the vehicle is level and at rest for any h, and h is free above its lower bound.
+Fixing h = 0 there would make it impossible to leave rest, since ω is per s. Body rates at the ends are free
 as well: a first step of Eq. 23 from ω = 0 could not tilt the vehicle.
 """
 
@@ -26,7 +26,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 
 VARIABLES = 16
 # A node: 3 force, 3 torque, acceleration², angular velocity², tilt, specific thrust, yaw fixed, yaw at the start,
-# angular acceleration² as a share
+# angular acceleration² over its limit²
 ROWS = 13
 STEP_ROWS = 8  # an interval: h, q, ω
 H_LEAST = 1e-3
@@ -51,10 +51,10 @@ def build_toppquad(
     max_seconds: float,
     penalty: float = PENALTY,
 ) -> ToppquadNlp:
-    """Build the program, once for a number of grid points, an airframe, a limit of angular acceleration, rad/s², and λ.
+    """Build the program, cached by number of grid points, airframe, limit of angular acceleration, rad/s², and λ.
 
-    Path, grid and the other limits are parameters and bounds. That limit is not, because without one its row must go:
-    left in, but unbounded, it takes IPOPT ten times as long.
+    Path, grid and the other limits are parameters and bounds. This limit is not, because without one its row must be
+    absent: an unbounded row takes IPOPT ten times as long.
     """
     import casadi
 

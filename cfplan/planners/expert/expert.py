@@ -7,13 +7,13 @@ interval, where h''' and ψ'' jump, and at points inside (problem.py). Three str
 
     OPTIMUM      from a guess to the optimum
     early()      from a guess to within about 0.02 % of it, in half the time; gives up early if there is no solution
-    refining()   as near, from a near-feasible profile, in a fraction of the steps
+    refining()   to the same accuracy, from a near-feasible profile, in a fraction of the steps
 
 Between the points a limit can still be exceeded by about a percent. The solution is checked densely; in each interval
 that exceeds a limit, that limit is lowered by the excess, and the problem is solved again from there, which takes a few
 iterations and makes the flight about 0.01 % longer. Long paths are planned in windows (windows.py).
 
-At a rest (γ' = γ'' = γ''' = 0) h has no effect on the motion and hardly any on its first derivatives, so an optimiser
+At a rest (γ' = γ'' = γ''' = 0) h has no effect on the motion and almost none on its first derivatives, so an optimiser
 lets it diverge or fall to zero. There h stays constant over the first, or last, interval.
 """
 
@@ -80,7 +80,7 @@ def plan_early(task: PlanningTask, enough: float = TUNING.enough) -> Solution:
 def can_begin(task: PlanningTask) -> bool:
     """Return whether the beginning of a task that starts in motion can be planned, regardless of the rest.
 
-    If it cannot, the task has no plan; if it can, there mostly is a plan, as the vehicle may fly slower farther on.
+    If it cannot, the task has no plan; if it can, there usually is one, as the vehicle may fly slower farther on.
     In marginal cases one of the two searches may fail alone: of 6,245 paths that began in motion the answer was right
     for 6,240, in half the time that plan_early() takes to fail, and a fifth of the time that it takes to succeed.
     """
@@ -98,7 +98,7 @@ def refine(task: PlanningTask, profile: SpeedProfile, *, window: WindowSize = TU
     """Refine a near-feasible profile on its grid to within about 0.02 % of the fastest.
 
     Yaw is that of the profile, not of the task; if the task leaves it free it is optimised too. If the solution has a
-    reason besides a profile, the reason says from where on the profile was left as given.
+    reason besides a profile, the reason names the place from which the profile is unchanged.
     """
     *_, last = refinements(task, profile, window=window)
     return last
@@ -109,7 +109,7 @@ def refinements(
 ) -> Iterator[Solution]:
     """Yield the refined profile, after each round in which limits exceeded between points are lowered.
 
-    The first mostly passes the certificate. A path longer than `window` is planned window by window and yields one
+    The first usually passes the certificate. A path longer than `window` is planned window by window and yields one
     profile, after all rounds. A failure is the only item. After the task's deadline the rest stays as given.
     """
     began, nodes = time.perf_counter(), len(profile.s) - 1

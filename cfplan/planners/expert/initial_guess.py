@@ -72,12 +72,12 @@ def _yaw(start: BoundaryState | None, yaw: float, nodes: int, step: float) -> ND
     return np.asarray(spline)
 
 
-def lowered(coefficients: NDArray, share: float, held: bool, rate: float) -> NDArray:
-    """Return the coefficients with h lowered by a fraction `share`, less so next to a start `held` by a boundary state.
+def lowered(coefficients: NDArray, fraction: float, held: bool, rate: float) -> NDArray:
+    """Return the coefficients with h lowered by this fraction, less so next to a start `held` by a boundary state.
 
-    `rate` is how many intervals a second pass where x is 1.
+    `rate` is the number of intervals passed per second where x is 1.
     """
-    result, less = coefficients.copy(), np.full(len(coefficients), float(share))
+    result, less = coefficients.copy(), np.full(len(coefficients), float(fraction))
     if held:
         to = max(_G.lowered_to, int(_G.lowered_time * rate * np.sqrt(max(coefficients[1, 0], 0.0))))
         count = min(len(less), to)

@@ -45,7 +45,7 @@ class DensePath:
     """A path's derivatives at many places of every interval, evaluated once."""
 
     def __init__(self, path: Path, nodes: int, held: NDArray, caps: SpeedCaps | None = None) -> None:
-        """Take `held`, (N,): how far, 0 to 1, boundary states decide each interval, whose violation counts less."""
+        """Take `held`, (N,), 0 to 1: how far boundary states fix each interval, whose violation counts less."""
         self.held = held
         step = path.end / nodes
         refined = turns(path, nodes) > TUNING.sharp
@@ -77,8 +77,8 @@ class DensePath:
 def _laid_out(
     refined: NDArray, jumps: NDArray, usual: NDArray, fine: NDArray, step: float
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return the allowance of each interval, (N, MEASURES), and the first place of each, (N+1,); and of each place its
-    interval and s: one interval's after another's."""
+    """Return the allowance of each interval, (N, MEASURES), and the first place of each, (N+1,); and of every place the
+    interval and s: those of one interval after those of another."""
     allowance, begins = np.empty((len(refined), len(jumps))), np.zeros(len(refined) + 1, np.int64)
     for k in range(len(refined)):
         begins[k + 1] = begins[k] + (len(fine) if refined[k] else len(usual))

@@ -34,5 +34,5 @@ def common_data(airframe: Airframe, limits: PlanLimits, scale: float) -> NDArray
 
 
 def variables(free_yaw: bool) -> int:
-    """Return how many numbers determine a point, and how many spline coefficients determine those."""
+    """Return how many spline coefficients determine a point; as many values of h and yaw follow from them."""
     return 7 if free_yaw else 4

@@ -99,7 +99,7 @@ def layout_of(shape: Shape) -> Layout:
 
 @dataclass(frozen=True, slots=True)
 class Ends:
-    """How a segment begins, and whether another goes on from it. Its end is free, or at rest where the path is."""
+    """The start of a segment, and whether another continues it. Its end is free, or at rest where the path is."""
 
     start: BoundaryState | None  # None where it is free
     continues: bool = False  # whether the start is a joint, which another problem's solution crossed with room to spare

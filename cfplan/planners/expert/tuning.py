@@ -31,12 +31,12 @@ class Guess(NamedTuple):
     h_blend: float = 5.0  # over which h comes away from a boundary state: in fewer it jerks, in more it cannot brake
     yaw_blend: float = 4.0
     lowered_from: int = 3  # coefficients from a held end, where h begins to be lowered
-    lowered_to: int = 10  # and from where on it is lowered in full; on a fine grid, where these take no time to pass,
-    lowered_time: float = 0.15  # s, after as many as take this long
+    lowered_to: int = 10  # and from which it is lowered fully; on a fine grid, where these pass quickly,
+    lowered_time: float = 0.15  # s, after as many as take this time
 
 
 class Tuning(NamedTuple):
-    """The numbers by what they act on; a NamedTuple, as compiled functions read it."""
+    """The parameters, grouped by purpose; a NamedTuple, as compiled functions read it."""
 
     penalties: Penalties = Penalties()
     guess: Guess = Guess()
@@ -67,18 +67,18 @@ class Tuning(NamedTuple):
     stop_barrier: float = 0.15  # for each second that an interval takes: within about 0.02 % of the optimum
     stop_feasibility: float = 2e-4  # what remains of the constraints is a fraction of `margin`
     stop_gradient: float = 0.05
-    predicted_gradient_factor: float = 0.2  # of the gradient after a whole step; they leave less than a tenth
+    predicted_gradient_factor: float = 0.2  # of the gradient after a full step; it leaves less than a tenth
     loose_factor: float = 10.0  # times that much may remain before limits are tightened
-    least_step: float = 3e-3  # fraction of a step, below which a search from a guess is given up: 1 of 217 that
+    least_step: float = 3e-3  # fraction of a step, below which a search from a guess is abandoned: 1 of 217 that
     # succeeded had a shorter one, of 164 that failed all, and these end after half as many steps
 
     # Where the search begins, expert.py
     first_barrier_factor: float = 3.0  # times the last: with the last one, a search from far off stalls at its bounds
-    first_multipliers: float = 10.0  # times those of the last barrier: limits are used to the full
-    fallback_barrier_factor: float = 8.0  # 0.3 % from the optimum: where a search does not end otherwise, and under
+    first_multipliers: float = 10.0  # times those of the last barrier: limits are fully used
+    fallback_barrier_factor: float = 8.0  # 0.3 % from the optimum: for a search that does not end otherwise, and under
     # caps, which giving way finds step by step: from profiles at their limits it finds lower ones
     initial_h_reduction: float = 0.1  # fraction of h that refining begins below: constraints begin inside their bounds
-    stall_iterations: int = 16  # from which a search may have stopped 3 % short, and goes on once more
+    stall_iterations: int = 16  # after which a search may have stalled 3 % from the optimum, and is continued once
 
     # Windows, windows.py
     window: WindowSize = WindowSize(kept=96, ahead=24)  # longer windows take more iterations
@@ -86,8 +86,8 @@ class Tuning(NamedTuple):
     lookahead: float = 2.5  # m beyond twice the braking distance: attitude takes time to turn, and curves leave little
     # acceleration to brake with. Windows then fail on 2 of 160 paths of 40 to 100 m; with 0.5 m they fail on 8
 
-    # Whether a motion leads on, expert.py
-    beginning: float = 0.6  # s within which that shows
+    # Whether a motion can continue, expert.py
+    beginning: float = 0.6  # s within which that is decided
     least_beginning: int = 12
 
 

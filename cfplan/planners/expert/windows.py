@@ -20,7 +20,7 @@ from cfplan.vehicle.yaw_spline import YawSpline
 
 
 class Tightened(NamedTuple):
-    """A window's solution after tightening, which mostly keeps its limits between the points too."""
+    """A window's solution after tightening, which usually keeps its limits between the points too."""
 
     coefficients: NDArray  # (N+3, 1 or 2)
     rounds: int  # of tightening
@@ -34,7 +34,7 @@ class Joined(NamedTuple):
     joints: tuple[float, ...]  # s, where windows meet
     iterations: int
     rounds: int  # of tightening
-    unfinished: str = ""  # why the windows from some place on were left as given; empty if all are solved
+    unfinished: str = ""  # why the remaining windows are unchanged; empty if all are solved
 
 
 def windows_of(path: Path, nodes: int, size: WindowSize, limits: PlanLimits) -> list[tuple[int, int, int]]:

@@ -25,7 +25,7 @@ TERMS = ("sigma", "multiplier", "barrier", "residual")
 # Of each constraint, by row: Σ, the curvature that its slack's barrier adds; the multiplier y of g; the slope of a
 # barrier of weight 1 at the slack; and Σ (g - s).
 FAR = 1e20
-COMPLEMENTARY = 1e10  # how far a multiplier may be from what the barrier makes of its slack, as a factor
+COMPLEMENTARY = 1e10  # factor within which a multiplier stays of the one that the barrier prescribes for its slack
 
 # Freedom in the order of sums that lets NaN survive.
 _SUMS = {"contract", "reassoc", "nsz", "arcp"}
@@ -33,19 +33,19 @@ _LANES = 16  # numbers that the processor may compare at once
 
 
 class Errors(NamedTuple):
-    """How far slacks and multipliers are from the solution of the barrier's problem."""
+    """The distance of slacks and multipliers from the solution of the barrier problem."""
 
     infeasibility: float  # the largest |g - s|
     complementarity: float  # the largest difference of a slack's product with its multiplier from the barrier
 
 
 class SearchDirection(NamedTuple):
-    """A step of slacks and multipliers, and how much of it keeps them inside."""
+    """A step of slacks and multipliers, and the step lengths that keep them inside."""
 
     step: NDArray  # (3, m)
     slope: float  # of the barrier along it
-    share: float  # of the step of the slacks, at most 1
-    share_dual: float  # of the step of the multipliers, at most 1
+    alpha_primal: float  # step length of the slacks, at most 1
+    alpha_dual: float  # step length of the multipliers, at most 1
 
 
 @njit
@@ -206,15 +206,15 @@ def merit_terms(g, bounds, slacks, step, share, barrier, rows):
 
 
 def accept_step(
-    g: NDArray, bounds: NDArray, slacks: NDArray, direction: SearchDirection, share: float, barrier: float
+    g: NDArray, bounds: NDArray, slacks: NDArray, direction: SearchDirection, alpha_primal: float, barrier: float
 ) -> tuple[NDArray, NDArray, Errors]:
-    """Return (slacks, terms, Errors) after a share of the slacks' step, which led to g.
+    """Return (slacks, terms, Errors) after a step of length `alpha_primal` of the slacks, which led to g.
 
-    Multipliers go as far as they may, and stay within a factor of what the barrier makes of their slacks.
+    Multipliers take their full step length, and stay within COMPLEMENTARY of those that the barrier prescribes.
     """
     after, terms = np.empty_like(slacks), np.empty((4, len(g)))
-    step, share_dual = direction.step, direction.share_dual
-    return after, terms, Errors(*_accept_step(g, bounds, slacks, step, share, share_dual, barrier, after, terms))
+    step, alpha_dual = direction.step, direction.alpha_dual
+    return after, terms, Errors(*_accept_step(g, bounds, slacks, step, alpha_primal, alpha_dual, barrier, after, terms))
 
 
 @njit(error_model="numpy", fastmath=_SUMS)

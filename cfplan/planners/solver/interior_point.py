@@ -1,7 +1,7 @@
 """A primal-dual interior point method for nonlinear programs with a banded Newton matrix.
 
-Where variables are spline coefficients there are no equations to keep, and a coefficient meets only its neighbours: the
-Newton matrix is banded, and factoring it costs less than evaluating the functions. With slacks s for the constraints,
+If variables are spline coefficients there are no equality constraints, and a coefficient is coupled only to neighbours:
+the Newton matrix is banded, and factoring it costs less than evaluating the functions. With slacks s for constraints,
 
     minimise f(v)   subject to   g(v) = s,   lower ≤ s ≤ upper,
 
@@ -36,7 +36,7 @@ from cfplan.planners.solver.barrier import (
 BOUNDARY = 0.99  # of the way to a bound that a step may go, at least
 BARRIER_FACTOR, BARRIER_POWER = 0.2, 1.5  # how fast the barrier parameter falls
 BARRIER_SOLVED = 10.0  # times the barrier parameter: the error at which it falls
-FILTER = 1e-5  # share of the infeasibility by which a step must reduce it, or the cost
+FILTER = 1e-5  # fraction of the infeasibility by which a step must reduce it, or the cost
 SWITCH_COST, SWITCH_FEASIBILITY = 2.3, 1.1
 ARMIJO = 1e-4
 HALVINGS = 14
@@ -78,7 +78,7 @@ class NonlinearProgram(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Search:
-    """How to search; the numbers are in the problem's own units."""
+    """Parameters of a search; the numbers are in the problem's own units."""
 
     barrier: float = 1.0  # at first
     last_barrier: float = 3e-3
@@ -86,20 +86,20 @@ class Search:
     feasibility: float = 1e-5  # of the constraints, at the end
     predicted_gradient_factor: float | None = None  # of the gradient, left by a full step; None: always computed
     push: float = 1e-2  # how far slacks start inside their bounds at least, of the span between them
-    multipliers: float = 1.0  # at first, times what the barrier makes of their slacks
+    multipliers: float = 1.0  # at first, times those that the barrier prescribes for their slacks
     iterations: int = 100
-    least_step: float = 0.0  # share of a Newton step; one that must be shorter is the last: there may be no solution
+    least_step: float = 0.0  # fraction of a Newton step; one that must be shorter is the last: there may be no solution
 
 
 class Multipliers(NamedTuple):
-    """What a search knows of the constraints where it ends, for another to go on from there."""
+    """Slacks and multipliers at the end of a search, from which another can continue."""
 
     bounds: NDArray  # (5, m) of that search
     slacks: NDArray  # (3, m) with their multipliers
 
 
 class SearchResult(NamedTuple):
-    """Where a search ended."""
+    """The result of a search."""
 
     v: NDArray
     values: Values  # there
@@ -111,7 +111,7 @@ class SearchResult(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Filter:
-    """Which pairs of infeasibility and merit no step may fall behind."""
+    """The filter: pairs of infeasibility and merit that a step must improve on."""
 
     most: float  # infeasibility
     pairs: list[tuple[float, float]] = field(default_factory=list)
@@ -136,7 +136,7 @@ class _Filter:
 
 
 class _Here(NamedTuple):
-    """Where a line search begins, and its direction."""
+    """The start and direction of a line search."""
 
     v: NDArray
     dv: NDArray
@@ -149,7 +149,7 @@ class _Here(NamedTuple):
 class _Step(NamedTuple):
     v: NDArray
     values: Values
-    share: float
+    alpha_primal: float  # step length
     infeasible: float
     walls: float  # the barrier's cost
     widens: bool  # the filter
@@ -161,8 +161,8 @@ def minimise(
 ) -> SearchResult:  # fmt: skip
     """Search from v, where the functions must be defined, until the deadline.
 
-    With the multipliers `known` from a search of nearly the same problem, whose bounds alone may differ, it goes on
-    where that one ended; else it begins with what the barrier makes of its slacks.
+    With the multipliers `known` from a search of a problem that differs at most in its bounds, it continues that
+    search; else it begins with the multipliers that the barrier prescribes.
     """
     barrier, bounds, rows = search.barrier, program.bounds, program.rows
     values = program.evaluate(v)
@@ -200,15 +200,15 @@ def minimise(
         del near, dg  # so that the next ones get their memory, which the processor's cache still holds
         here = _Here(v, dv, slacks, infeasible, values.cost + walls, slope + direction.slope)
         step = _line_search(program, here, direction, barrier, filtered)
-        if step is None or step.share < search.least_step:
+        if step is None or step.alpha_primal < search.least_step:
             return ended(False, iteration, "no step improves the solution")
         if step.widens:
             filtered.pairs.append(((1 - FILTER) * infeasible, here.merit - FILTER * infeasible))
         v, values, infeasible, walls = step.v, step.values, step.infeasible, step.walls
-        slacks, terms, off = accept_step(values.constraints, bounds, slacks, direction, step.share, barrier)
-        whole = step.share == direction.share_dual == 1.0
+        slacks, terms, off = accept_step(values.constraints, bounds, slacks, direction, step.alpha_primal, barrier)
+        full = step.alpha_primal == direction.alpha_dual == 1.0
         del here, direction
-        if search.predicted_gradient_factor is not None and whole and barrier <= search.last_barrier:
+        if search.predicted_gradient_factor is not None and full and barrier <= search.last_barrier:
             left = search.predicted_gradient_factor * off_gradient
             if _error(off, left, search) <= BARRIER_SOLVED * barrier:
                 return ended(True, iteration + 1, f"solved in {iteration + 1} iterations")
@@ -249,23 +249,23 @@ def _line_search(
     program: NonlinearProgram, here: _Here, direction: SearchDirection, barrier: float, filtered: _Filter
 ) -> _Step | None:
     """Halve the step until the filter takes it; None where it never does."""
-    share = direction.share
+    alpha = direction.alpha_primal
     for _ in range(HALVINGS):
-        there = here.v + share * here.dv
+        there = here.v + alpha * here.dv
         values = program.evaluate(there)
         infeasible, walls = merit_terms(
-            values.constraints, program.bounds, here.slacks, direction.step, share, barrier, program.rows
+            values.constraints, program.bounds, here.slacks, direction.step, alpha, barrier, program.rows
         )
         if verdict := filtered.judge(
-            (here.infeasible, here.merit), (infeasible, values.cost + walls), share * here.slope
+            (here.infeasible, here.merit), (infeasible, values.cost + walls), alpha * here.slope
         ):
-            return _Step(there, values, share, infeasible, walls, verdict == "widens")
-        share /= 2
+            return _Step(there, values, alpha, infeasible, walls, verdict == "widens")
+        alpha /= 2
     return None
 
 
 def _error(off: Errors, off_gradient: float, search: Search) -> float:
-    """Return how far this is from the barrier's solution, in units of the barrier."""
+    """Return the distance from the barrier's solution, in units of the barrier."""
     return max(
         off.infeasibility / search.feasibility * search.last_barrier,
         off_gradient / search.gradient * search.last_barrier,

@@ -44,7 +44,7 @@ _HINT = "the first line must name the columns t, x, y, z and, for attitudes, qx,
 
 
 def _pose(place: str, turn: str) -> Columns:
-    """Return the columns of a pose that are named so, with the axis in the place of `?`."""
+    """Return the columns of a pose by patterns of their names, with the axis in the place of `?`."""
     return {c: ((turn if c in QUATERNION else place).replace("?", c[-1]), 1.0) for c in POSE}
 
 

@@ -92,7 +92,7 @@ def read(file: Path) -> MocapLog:
     subjects = [subject(name, _in_root_frame(name, tables, parents)) for name in tables]
     roots = sorted(set(parents.values()) - set(tables))
     if len(roots) > 1:
-        notes.append(f"poses are in the frames {', '.join(roots)}; how these lie to one another is not in the bag")
+        notes.append(f"poses are in the frames {', '.join(roots)}; their relation is not in the bag")
     return MocapLog(FORMAT, tuple(subjects), tuple(notes), truncated)
 
 

@@ -38,7 +38,7 @@ _FORM = "as in udp:127.0.0.1:14550, where the ground station listens"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the ground station is."""
+    """The address of the ground station."""
 
     host: str
     port: int
@@ -139,11 +139,11 @@ class GroundStation:
     def write(self, packet: bytes) -> None:
         """Send a packet; the dialect's encoder calls this."""
         self._keep(packet)
-        with contextlib.suppress(OSError):  # nobody is listening
+        with contextlib.suppress(OSError):  # no listener
             self._socket.sendto(packet, self._target)
 
     def _serve(self) -> float:
-        """Hear what has come, send what is due, and return s until something is due again."""
+        """Read received packets, send due messages, and return s until the next is due."""
         for act in (self._listen, self._send_due):
             try:
                 act()
@@ -246,7 +246,7 @@ def messages_in(data: bytes) -> Iterator[tuple[bytes, Any]]:
         if 0 < size == len(packet):
             with contextlib.suppress(dialect.MAVError):
                 message = dialect.MAVLink(None).decode(bytearray(packet))
-        if message is None or isinstance(message, dialect.MAVLink_unknown):  # of which no checksum can be known
+        if message is None or isinstance(message, dialect.MAVLink_unknown):  # whose checksum is unknown
             place += 1
             continue
         yield packet, message
@@ -273,7 +273,7 @@ def _dialect() -> Any:
 
 
 def _open(place: Place) -> tuple[socket.socket, Any]:
-    """Open a socket, which only this machine reaches where the place is on it; return it and the place's address."""
+    """Open a socket, reachable only from this machine if the place is on it; return it and the place's address."""
     try:
         family, kind, _, _, address = socket.getaddrinfo(place.host, place.port, type=socket.SOCK_DGRAM)[0]
         link = socket.socket(family, kind)

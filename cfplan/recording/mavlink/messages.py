@@ -40,7 +40,7 @@ class Latest:
         return self.status.supervisor if self.status is not None else 0
 
 
-# From the dialect's encoder and the newest state to a message; None where nothing is known yet.
+# A function from the dialect's encoder and the newest state to a message; None if nothing is known yet.
 Make = Callable[[Any, Latest], Any]
 
 

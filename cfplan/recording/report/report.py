@@ -47,8 +47,8 @@ def reported(record: Record, name: str) -> ReportedFlight:
                 ("planner", plan.planner),
                 ("grid", f"{plan.nodes} intervals"),
                 ("planning", f"{plan.seconds:.2f} s"),
-                ("share of the planner's speed", f"{plan.repair_speed_factor:.4g}"),
-                ("share of the speed asked for", f"{plan.speed_factor:.4g}"),
+                ("fraction of the planner's speed", f"{plan.repair_speed_factor:.4g}"),
+                ("fraction of the requested speed", f"{plan.speed_factor:.4g}"),
                 *(("note", note) for note in plan.notes),
             ]
         except CfplanError as error:

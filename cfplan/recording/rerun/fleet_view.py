@@ -32,7 +32,7 @@ _TITLES = {
 
 
 def write_fleet(fleet: FleetRecord, file: Path, *, overwrite: bool = False) -> None:
-    """Write the recording; whole or not at all. Raises InputError where the file cannot be."""
+    """Write the recording atomically. Raises InputError if it cannot be written."""
     save(file, blueprint(fleet), partial(log_fleet, fleet=fleet), overwrite=overwrite)
 
 

@@ -36,7 +36,7 @@ SUMMARY = "summary"
 
 TAIL_SECONDS = 2.0
 LONG_IN_Y, LONG_IN_X = (0.76, -0.20, 0.52), (-0.20, -0.76, 0.52)
-"""From where a room is looked at, from its centre and in lengths of its diagonal, so that all of it is in sight."""
+"""Camera positions from the room's centre, in lengths of its diagonal, from which all of the room is in sight."""
 PlayState = Literal["paused", "playing", "following"]
 _STATES = "Phases, limit that holds the plan back, supervisor"
 
@@ -46,7 +46,7 @@ def blueprint(
 ) -> rrb.Blueprint:
     """Return the layout: 3-D at the left, the plots beside it in two columns, phases, events and the summary below.
 
-    All plots show `span`, s on the timeline, where it is given: a flight that goes on has none.
+    All plots show `span`, s on the timeline, if it is given: a flight in progress has none.
     """
     grid = rrb.Grid(*(time_plot(name, title, span) for name, title in TITLES.items()), grid_columns=2)
     below = rrb.Horizontal(

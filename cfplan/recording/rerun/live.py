@@ -76,7 +76,7 @@ class LiveView:
         self._waiting: deque[Telemetry] = deque(maxlen=CAPACITY)
         self._start: float | None = None  # s, of the first message: 0 on the timeline
         self._carried: dict[type, Telemetry] = {}
-        self._drawn: set[str] = set()  # the outlines that stand already
+        self._drawn: set[str] = set()  # outlines drawn so far
         self.failure = ""  # why the view ends early, one line
         self._laid_out = False
         self._sending: Repeated | None = None
@@ -100,7 +100,7 @@ class LiveView:
             if not self._laid_out:
                 self._lay_out()
             self._send()
-        except Exception as error:  # a viewer that was closed must not be heard of in the flight
+        except Exception as error:  # a closed viewer must not affect the flight
             self.failure = f"the live view ended: {error}"
             return None
         return PERIOD
@@ -113,7 +113,7 @@ class LiveView:
             self._stream.disconnect()
 
     def _lay_out(self) -> None:
-        """Send what does not change during the flight."""
+        """Send the entities that do not change during the flight."""
         empty = _part(self._header, [])
         self._stream.send_recording_name(self._header.name)
         log_room(self._stream, self._header)

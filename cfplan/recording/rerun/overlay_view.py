@@ -28,7 +28,7 @@ from cfplan.recording.rerun.viewer import open_viewer, save
 COLOURS: tuple[Colour, ...] = (FOUR[0], WANTED, *FOUR[1:], (213, 94, 0), (0, 114, 178))
 ARM = 0.0375  # m, of the vehicle as drawn: a log does not know its size
 DASH = 0.05  # m, of the reference as drawn, and as much between two
-MOST_DASHES = 20_000
+MAX_DASHES = 20_000
 DRAWN_RATE = 100.0  # Hz: more poses than that are not drawn in 3-D, as they could not be distinguished
 _REFERENCE, _TRIAL = f"{WORLD}/reference", f"{WORLD}/trial"
 _AXES = "xyz"
@@ -36,7 +36,7 @@ _CAMERA_DISTANCE_FACTOR = 1.25  # times as far as in the view of one record, whi
 
 
 def write_overlay(trials: Sequence[Trial], file: Path, *, overwrite: bool = False) -> None:
-    """Write the recording; whole or not at all. Raises InputError where the file cannot be."""
+    """Write the recording atomically. Raises InputError if it cannot be written."""
     save(file, blueprint(trials), partial(log_trials, trials=trials), overwrite=overwrite)
 
 
@@ -77,7 +77,7 @@ def time_plots(trials: Sequence[Trial], names: Mapping[str, str]) -> list[rrb.Ti
 
 
 def window(views: rrb.Container) -> rrb.Blueprint:
-    """Return the layout of these views, with nothing else in the window than the time."""
+    """Return the layout of these views, with only the time panel besides."""
     return rrb.Blueprint(
         views,
         rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="paused"),
@@ -88,7 +88,7 @@ def window(views: rrb.Container) -> rrb.Blueprint:
 
 
 def room(trials: Sequence[Trial], name: str) -> rrb.Spatial3DView:
-    """Return the 3-D view, with all that the trials pass in sight."""
+    """Return the 3-D view, which shows everything that the trials pass."""
     low, high = extent(trials)
     centre, size = (low + high) / 2, max(float(np.linalg.norm(high - low)), 1.0)
     aside = _CAMERA_DISTANCE_FACTOR * np.array(
@@ -153,7 +153,7 @@ def dashes(points: NDArray) -> list[NDArray]:
     if len(points) < 2:
         return []
     along = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    dash = max(DASH, along[-1] / (2 * MOST_DASHES))
+    dash = max(DASH, along[-1] / (2 * MAX_DASHES))
     places = np.arange(0.0, along[-1], 2 * dash)
     ends = np.stack([places, np.minimum(places + dash, along[-1])], axis=1)
     moving = np.r_[True, np.diff(along) > 0]
@@ -204,7 +204,7 @@ def log_curve(
     style = rr.SeriesLines(colors=[colour], names=[label], widths=[1.5], aggregation_policy="MinMax")
     stream.log(entity, style, static=True)
     known = np.isfinite(values)
-    known[1:] |= known[:-1].copy()  # what is not a number behind each stretch, so that no line leads over a gap
+    known[1:] |= known[:-1].copy()  # a NaN behind each stretch, so that no line bridges a gap
     if known.any():
         columns = rr.Scalars.columns(scalars=values[known])
         stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time[known])], columns, strict=True)

@@ -20,7 +20,7 @@ from cfplan.recording.rerun.viewer import Draw, free_port, save, viewer_program
 SIZE = (1920, 1080)  # points, of the window that is never shown
 _START_TIMEOUT = 30.0  # s
 _LOAD_TIMEOUT = 60.0  # s
-_SETTLE_TIME = 5.0  # s until plots have found their ranges and the viewer no longer says hello
+_SETTLE_TIME = 5.0  # s until plots have found their ranges and the viewer's greeting is gone
 _NO_DRIVER_WORDS = ("No graphics adapter", "Failed to get render context", "Vulkan")
 
 
@@ -29,7 +29,7 @@ class View:
     """One view of the window."""
 
     name: str
-    reports: tuple[str, ...]  # what could not be drawn
+    reports: tuple[str, ...]  # failures to draw
     identity: str
 
 
@@ -38,7 +38,7 @@ def write_png(
 ) -> tuple[str, ...]:
     """Write the whole view at a moment, s on the timeline, and return the viewer's complaints.
 
-    Raises InputError where the file cannot be written or where there is nothing to draw with.
+    Raises InputError if the file cannot be written or there is no graphics driver.
     """
     check_new_file(file, overwrite=overwrite)
     with tempfile.TemporaryDirectory(prefix="cfplan-") as folder:
@@ -112,7 +112,7 @@ class HeadlessViewer:
         return self._client.take_screenshot(view.identity if view is not None else None)
 
     def complaints(self) -> tuple[str, ...]:
-        """Return what could not be drawn, and every other error."""
+        """Return failures to draw, and every other error."""
         complaints = [f"{view.name}: {report}" for view in self.views() for report in view.reports]
         complaints += [entry.message for entry in self._client.get_logs() if entry.level.upper() == "ERROR"]
         return tuple(complaints)

@@ -1,4 +1,4 @@
-"""Draw the plan in the rerun view: where its pieces join, and where which limit holds it back."""
+"""Draw the plan in the rerun view: the joints of its pieces, and the active limit along it."""
 
 import numpy as np
 import rerun as rr

@@ -1,7 +1,7 @@
 """Draw a flight as a rerun recording: room, path and vehicle in 3-D, plots with their limits, phases and events.
 
-Everything is sent as whole columns after the flight; the stream's process never sees any of this. All times are seconds
-since the record's first message, on the one timeline `flight`.
+Everything is sent as complete columns after the flight; the stream's process never sees any of this. All times are
+seconds since the record's first message, on the one timeline `flight`.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ from cfplan.vehicle.rotations import about_z
 AXIS_LENGTH = 0.25  # m, of the body axes as drawn
 LARGEST_FLOOR = 100.0  # m, from the origin, that is drawn
 STRIPS_AT_ONCE = 500  # `rerun rrd verify` takes a time that grows with the square of the strips in one chunk
-BODY_SCALE = 4.0  # the vehicle is drawn larger than it is, or it could not be seen in its room
+BODY_SCALE = 4.0  # the vehicle is enlarged, to be visible in its room
 TRACK_RADIUS, TAIL_RADIUS, WANTED_RADIUS, PATH_RADIUS = 0.004, 0.02, 0.01, 0.006  # m, of the lines
 HOVER_ARROW = 0.35  # m, of the thrust in hover
 THRUST_COLOUR: Colour = (240, 228, 66)
@@ -51,7 +51,7 @@ LEVEL_NAMES = {Level.INFO: "INFO", Level.WARNING: "WARN", Level.ERROR: "ERROR"}
 
 
 def write_rrd(record: Record, file: Path, *, overwrite: bool = False) -> None:
-    """Write the recording with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
+    """Write the recording with its blueprint atomically. Raises InputError if it cannot be written."""
     save(
         file,
         _blueprint(record),
@@ -104,7 +104,7 @@ def log_record(stream: rr.RecordingStream, record: Record) -> None:
 
 
 def log_room(stream: rr.RecordingStream, header: RecordHeader) -> None:
-    """Send what stands still: fence, floor, and the path."""
+    """Send the static entities: fence, floor, and the path."""
     low, high = np.array(header.fence)
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     box = rr.Boxes3D(mins=[low], sizes=[high - low], colors=[FENCE_COLOUR], fill_mode="MajorWireframe")
@@ -147,7 +147,7 @@ def floor_lines(low: NDArray, high: NDArray) -> list[NDArray]:
 
 
 def log_styles(stream: rr.RecordingStream, shown: Sequence[Plot]) -> None:
-    """Send the styles of everything that has a time."""
+    """Send the styles of all entities with a time."""
     stream.log(layout.BODY, rr.TransformAxes3D(AXIS_LENGTH), static=True)
     stream.log(layout.THRUST, rr.Arrows3D.from_fields(colors=[THRUST_COLOUR], radii=[0.008]), static=True)
     for plot in shown:
@@ -209,9 +209,9 @@ def _log_thrust(stream: rr.RecordingStream, record: Record, start: float) -> Non
 
 
 def log_outline(stream: rr.RecordingStream, entity: str, arm: float, times: NDArray, colour: Colour) -> None:
-    """Send the outline of the vehicle from the first of the times to the last, so that it never stands at the origin.
+    """Send the outline of the vehicle from the first of the times to the last, so that it is never drawn at the origin.
 
-    With one time alone it stands from then on.
+    With a single time it is drawn from then on.
     """
     strips = vehicle_outline(arm * BODY_SCALE)
     ends = rr.TimeColumn(layout.TIMELINE, duration=times[[0, -1]] if len(times) > 1 else times)
@@ -290,7 +290,7 @@ def _log_events(stream: rr.RecordingStream, record: Record, start: float) -> Non
 
 
 def _log_commitments(stream: rr.RecordingStream, record: Record, start: float) -> None:
-    """Send where the vehicle was bound to fly from each moment on, at which a plan was committed in flight."""
+    """Send the path to which the vehicle was committed, at each time when a plan was committed in flight."""
     commitments = record.commitments
     if not len(commitments.time):
         return

@@ -18,7 +18,7 @@ Draw = Callable[[rr.RecordingStream], None]
 
 
 def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = False) -> None:
-    """Write what `draw` sends, with its blueprint; whole or not at all. Raises InputError where the file cannot be."""
+    """Write what `draw` sends, with its blueprint, atomically. Raises InputError if the file cannot be written."""
     check_new_file(file, overwrite=overwrite)
     with atomic_output(file) as unfinished:
         unfinished.touch()
@@ -45,7 +45,7 @@ def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
 
 
 def lay_out(stream: rr.RecordingStream, blueprint: rrb.Blueprint) -> None:
-    """Send this blueprint; else the viewer takes the one that its window had last."""
+    """Send this blueprint; otherwise the viewer reuses the last one of its window."""
     stream.send_blueprint(blueprint, make_active=True, make_default=True)
 
 

@@ -159,7 +159,7 @@ usec: u8 reset
 velCtlPid: f32 vxKp* vxKi* vxKd* vxKFF* vyKp* vyKi* vyKd* vyKFF* vzKp* vzKi* vzKd* vzKFF*
 """
 
-# What firmware before a version lacks, parameters and log variables.
+# Parameters and log variables that came with a version of the firmware.
 CAME_WITH: dict[tuple[int, ...], tuple[str, ...]] = {
     (2024, 10): ("supervisor.landedTimeout", "supervisor.tmblChckEn", "hlCommander.groupmask"),
     (2025, 2): ("supervisor.prefltTimeout",),

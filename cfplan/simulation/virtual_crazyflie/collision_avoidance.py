@@ -1,4 +1,4 @@
-"""The firmware's on-board collision avoidance, for a vehicle alone: what it makes of a setpoint.
+"""The firmware's on-board collision avoidance: how it changes the setpoints of a vehicle without neighbours.
 
 Zhou, Wang, Bandyopadhyay and Schwager, "Fast, on-line collision avoidance for dynamic vehicles using buffered Voronoi
 cells" (2017). Without neighbours the cell is a box about the vehicle: as far as it may go at `maxSpeed` within
@@ -32,7 +32,7 @@ class CollisionAvoidance:
     _feasible: NDArray | None = None  # the last place that could be flown to
 
     def rewrite(self, setpoint: Setpoint, here: NDArray) -> Setpoint:
-        """Return what the controller is given for a setpoint, with the vehicle believed at `here`, (3,) m."""
+        """Return the setpoint that the controller receives, with the vehicle estimated to be at `here`, (3,) m."""
         mode = setpoint.mode[MODE_X]
         if not self.enable or mode not in (ABSOLUTE, VELOCITY_MODE):
             return setpoint

@@ -1,4 +1,4 @@
-"""The firmware's commander: which setpoint counts, by priority."""
+"""The firmware's commander: select the setpoint to fly, by priority."""
 
 from collections.abc import Callable
 from enum import IntEnum

@@ -1,4 +1,4 @@
-"""The interface of a virtual Crazyflie's firmware: another implementation takes the place of cfplan's own by it."""
+"""The interface of a virtual Crazyflie's firmware, by which another implementation can replace cfplan's own."""
 
 from collections.abc import Sequence, Set
 from typing import Protocol, runtime_checkable
@@ -25,15 +25,15 @@ class Firmware(Protocol):
         as a perfect low-pass filter would leave it. The arrays are used again: copy what must last. `voltage` is that
         of the battery under load, V.
 
-        Commands are fractions of the airframe's largest thrust, times 65,535. None says that nothing asks the motors to
-        turn, as without a setpoint or where the supervisor stops them: the lab counts such time in the air.
+        Commands are fractions of the airframe's largest thrust, times 65,535. None means that nothing commands the
+        motors to turn, as without a setpoint or where the supervisor stops them: the lab counts such time in the air.
         """
 
     def receive(self, packet: bytes) -> None:
         """Take a packet from the radio: CRTP header and payload, 1 to 31 bytes unless the sender errs."""
 
     def sent(self) -> list[bytes]:
-        """Return the packets for the radio since the last call, in order. Asked after each tick and each packet."""
+        """Return the packets for the radio since the last call, in order. Called after each tick and each packet."""
 
     def restart(self) -> None:
         """Start anew, as by switching power off and on; what is stored on board stays. The next tick is the first."""

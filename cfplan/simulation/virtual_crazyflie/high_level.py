@@ -1,6 +1,6 @@
 """The high-level commander (CRTP port 8): take-off, landing and go-to as septics, and uploaded polynomials.
 
-Idle, it asks for nothing, which is motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals and
+When idle it sends a null setpoint, motors off, every 10 ms at the lowest priority: the null-setpoint gap. Spirals and
 take-off and landing by speed are not simulated; they answer ENOEXEC. So do compressed pieces without an end, where the
 firmware would read on in its memory.
 """
@@ -36,7 +36,7 @@ _PLANNER_BUSY = 1
 _DEFINITIONS = 31
 _IN_MEMORY, _UNCOMPRESSED, _COMPRESSED = 1, 0, 1
 
-# The upper half of a septic on [0, 1] from what is left of value and derivatives 1 to 3 at its end.
+# The upper half of a septic on [0, 1] from the remainders of value and derivatives 1 to 3 at its end.
 _UPPER = np.linalg.inv(
     np.array([[1, 1, 1, 1], [4, 5, 6, 7], [12, 20, 30, 42], [24, 60, 120, 210]], dtype=float),
 )
@@ -44,7 +44,7 @@ _ORDERS = np.arange(8)
 
 
 class PlannerState(Enum):
-    """What the planner does."""
+    """The states of the planner."""
 
     IDLE = auto()
     FLYING = auto()
@@ -151,7 +151,7 @@ class HighLevelCommander:
         with np.errstate(all="ignore"):  # a client may send NaN
             goal = self._goal(time)
             body_rate = _body_rate(goal)
-        if np.isnan(goal.position[0]):  # all that the firmware looks at
+        if np.isnan(goal.position[0]):  # the firmware checks nothing else
             self.disable()
             return None
         self._last = goal
@@ -306,6 +306,6 @@ def _body_rate(goal: Goal) -> NDArray:
 
 
 def _cross(first: Sequence[float] | NDArray, second: Sequence[float] | NDArray) -> NDArray:
-    """Return the cross product, (3,): np.cross takes ten times as long for so little."""
+    """Return the cross product, (3,): np.cross takes ten times as long for a single pair."""
     (a, b, c), (x, y, z) = first, second
     return np.array([b * z - c * y, c * x - a * z, a * y - b * x])

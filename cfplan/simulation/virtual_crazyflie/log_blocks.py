@@ -22,9 +22,9 @@ _TOC, _SETTINGS, DATA_CHANNEL = range(3)
 _CREATE, _APPEND, _DELETE, _START, _STOP, _RESET, _CREATE_2, _APPEND_2, _START_2 = range(9)
 _NO_VARIABLE = 0xFFFF  # means an address in memory, which is not simulated
 
-MOST_BLOCKS = 16
-MOST_VARIABLES = 128
-MOST_BYTES = 26
+MAX_BLOCKS = 16
+MAX_VARIABLES = 128
+MAX_BYTES = 26
 
 Getter = Callable[[], float]
 
@@ -36,7 +36,7 @@ def log_toc(without: Collection[str] = ()) -> Toc:
         for group, kind, name in read_catalogue(LOG_VARIABLES)
         if f"{group}.{name}" not in without
     ]
-    return make_toc(tuple(variables), trailer=bytes((MOST_BLOCKS, MOST_VARIABLES)))
+    return make_toc(tuple(variables), trailer=bytes((MAX_BLOCKS, MAX_VARIABLES)))
 
 
 @dataclass(slots=True)
@@ -85,7 +85,7 @@ class LogBlocks:
         if command == _CREATE_2:
             if number in self._blocks:
                 return errno.EEXIST
-            if len(self._blocks) >= MOST_BLOCKS:
+            if len(self._blocks) >= MAX_BLOCKS:
                 return errno.ENOMEM
             self._blocks[number] = _Block()
             return self._append(self._blocks[number], rest)
@@ -114,9 +114,9 @@ class LogBlocks:
             layout = _FORMATS.get(code & _TYPE_MASK)
             if layout is None or number == _NO_VARIABLE or number >= len(self._getters):
                 return errno.ENOENT
-            if block.size + calcsize("<" + layout) > MOST_BYTES:
+            if block.size + calcsize("<" + layout) > MAX_BYTES:
                 return errno.E2BIG
-            if sum(len(each.getters) for each in self._blocks.values()) >= MOST_VARIABLES:
+            if sum(len(each.getters) for each in self._blocks.values()) >= MAX_VARIABLES:
                 return errno.ENOMEM
             getter, layout = self._getters[number], layout if layout in _FLOATING else layout.upper()
             block.layout = Struct(block.layout.format + layout)

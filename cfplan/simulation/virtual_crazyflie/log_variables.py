@@ -113,7 +113,7 @@ def _accelerations(loop: Loop) -> dict[str, Getter]:
 
 @njit
 def _in_world(belief: NDArray, vector: NDArray, axis: int) -> float:
-    """Return how much of a vector (3,) in body axes lies along an axis of the world."""
+    """Return the component of a vector, (3,) in body axes, along an axis of the world."""
     turn = matrix_of(belief[6:10])
     return turn[axis, 0] * vector[0] + turn[axis, 1] * vector[1] + turn[axis, 2] * vector[2]
 

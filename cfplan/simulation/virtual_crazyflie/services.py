@@ -1,4 +1,4 @@
-"""Services that a client asks for first: link and versions (CRTP ports 15 and 13), and memories (port 4)."""
+"""Services that a client requests first: link and versions (CRTP ports 15 and 13), and memories (port 4)."""
 
 from struct import unpack_from
 
@@ -45,7 +45,7 @@ def answer_platform(channel: int, payload: bytes, *, protocol: int, firmware: st
 
 
 class Memories:
-    """The list of memories; of these only the one for trajectories holds anything."""
+    """The list of memories; only the one for trajectories has any content."""
 
     def __init__(self) -> None:
         self.trajectory = bytearray(TRAJECTORY_MEMORY_SIZE)

@@ -23,13 +23,13 @@ from cfplan.simulation.engine.mellinger import (
     VELOCITY_MODE,
 )
 
-# Where each value lies, as in `mellinger`.
+# Place of each value, as in `mellinger`.
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
 QUATERNION, BODY_RATE = slice(9, 13), slice(13, 16)
 ROLL, PITCH, YAW, THRUST = range(16, 20)
 ROLL_RATE, PITCH_RATE, YAW_RATE = range(13, 16)
 
-_LEAST_THRUST, _MOST_THRUST = 1000, 60000
+_MIN_THRUST, _MAX_THRUST = 1000, 60000
 
 _VELOCITY_LEGACY, _HEIGHT_LEGACY, _ALTITUDE_HOLD, _HOVER_LEGACY = 1, 2, 4, 5
 _STOP, _POSITION, _VELOCITY, _HEIGHT, _HOVER, _MANUAL = 0, 7, 8, 9, 10, 11
@@ -47,7 +47,7 @@ class FirmwareAssert(Exception):
 
 @dataclass(slots=True)
 class Setpoint:
-    """Values and modes as in `mellinger`; a new one asks for nothing: motors off."""
+    """Values and modes as in `mellinger`; a new one is null: motors off."""
 
     values: NDArray = field(default_factory=lambda: np.zeros(SETPOINT_SIZE))  # (20,)
     mode: NDArray = field(default_factory=lambda: np.array(NOTHING))  # (7,)
@@ -56,7 +56,7 @@ class Setpoint:
 
 
 def decode_setpoint(payload: bytes) -> Setpoint:
-    """Decode a packet of port 7, channel 0; an unknown type asks for nothing.
+    """Decode a packet of port 7, channel 0; an unknown type gives a null setpoint.
 
     Raises FirmwareAssert on a wrong length.
     """
@@ -147,6 +147,6 @@ class AttitudeSetpoints:
         setpoint = Setpoint()
         _tilt(setpoint, roll, pitch)
         _turn_at(setpoint, -turn)
-        setpoint.values[THRUST] = 0 if self._locked or thrust < _LEAST_THRUST else min(thrust, _MOST_THRUST)
+        setpoint.values[THRUST] = 0 if self._locked or thrust < _MIN_THRUST else min(thrust, _MAX_THRUST)
         setpoint.mode[MODE_Z] = DISABLE
         return setpoint

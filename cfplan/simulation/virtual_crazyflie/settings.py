@@ -31,7 +31,7 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True)
 class VehicleSettings:
-    """How the vehicle is when it is switched on.
+    """The state of a vehicle when it is switched on.
 
     A firmware other than cfplan's own need not heed `auto_arming`, `protocol`, `firmware`, `stored`, `stubborn` and
     `parameter_delay`.
@@ -41,13 +41,13 @@ class VehicleSettings:
     yaw: float = 0.0  # rad
     auto_arming: bool | None = None
     """None: as the airframe's name says; brushed vehicles arm themselves, brushless ones wait for a request."""
-    charge: float = 1.0  # share of the battery's capacity
+    charge: float = 1.0  # fraction of the battery's capacity
     capacity: float = CAPACITY  # A s, of the battery
     sensors: Sensors = field(default_factory=Sensors)
     protocol: int = PROTOCOL_VERSION
     firmware: str = FIRMWARE_VERSION
     seed: int = 1  # of the sensors' noise
-    stored: Mapping[str, float] = field(default_factory=dict)  # parameters that it has other values of than the usual
+    stored: Mapping[str, float] = field(default_factory=dict)  # parameters whose values differ from the defaults
     stubborn: tuple[str, ...] = ()  # parameters that writing does not change
     parameter_delay: float = 0.0  # s until it answers a write
     make_firmware: FirmwareFactory | None = None  # None: as CFPLAN_FIRMWARE says, else cfplan's own

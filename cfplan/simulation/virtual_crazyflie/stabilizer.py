@@ -27,9 +27,9 @@ _CONTROLLER_SIZE = SETPOINT + SETPOINT_SIZE
 
 
 class Loop(NamedTuple):
-    """Everything that the compiled loop reads and changes, in place: views of one array of numbers, but for whole ones.
+    """The state of the compiled loop, changed in place: views of one array of floats, and the integers.
 
-    To take a call's arguments apart, array by array, would cost more than the arithmetic of a millisecond.
+    Unpacking the arguments of a call array by array would cost more than the arithmetic of a millisecond.
     """
 
     controller: NDArray  # (51,) as in `engine.layout`, of which it uses the Mellinger controller and the setpoint
@@ -115,7 +115,7 @@ class Stabilizer:
         self._switches[_IN_BODY:] = setpoint.velocity_in_body, allowed, flying, asked, self.mellinger
 
     def run(self, tick: int, gyroscope: NDArray, accelerometer: NDArray, poses: NDArray) -> NDArray | None:
-        """Run for the millisecond `tick`; return the motors' commands, (4,) 16 bits, None if nothing asks for any.
+        """Run for the millisecond `tick`; return the motors' commands, (4,) 16 bits, None if there is no command.
 
         `gyroscope` (3,) rad/s and `accelerometer` (3,) m/s² as measured; `poses` (n, 9) as in `kalman`.
         """

@@ -28,7 +28,7 @@ class State(IntEnum):
     CRASHED = 11
 
 
-# Tuples: an enum's hash runs as Python, and these are asked for a thousand times a second.
+# Tuples: an enum's hash runs as Python, and these are looked up a thousand times a second.
 _MAY_FLY = (State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
 _STAYS_ARMED = (*_MAY_FLY, State.ARMING)
 

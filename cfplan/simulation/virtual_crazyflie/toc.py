@@ -26,7 +26,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class Toc:
-    """A table with the checksum that clients keep it by."""
+    """A table with the checksum by which clients cache it."""
 
     variables: tuple[Variable, ...]
     checksum: int

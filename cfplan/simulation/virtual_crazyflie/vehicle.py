@@ -1,6 +1,6 @@
 """The virtual Crazyflie: body, sensors, battery and the radio's processor of a vehicle, around its firmware.
 
-Nothing but the sensors and the recorder sees the true state; the firmware flies on what it measures and is sent.
+Only the sensors and the recorder see the true state; the firmware flies by measurements and packets.
 """
 
 import os
@@ -55,7 +55,7 @@ class VirtualCrazyflie:
         self.wind = self._body[WIND : WIND + 3]  # (3,) m/s
         self.efficiency = self._body[EFFICIENCY : EFFICIENCY + 4]  # (4,) fraction of its thrust that each motor gives
         self.motors = np.zeros(4)  # commands, 16 bits
-        self.off_in_air = 0  # ms so far, in the air while nothing asked the motors to turn
+        self.off_in_air = 0  # ms so far, in the air while nothing commanded the motors to turn
         self.noise = _sensor_noise(settings.sensors, settings.seed)  # (8191, 6) gyroscope rad/s, accelerometer m/s²
         self._gyroscope, self._accelerometer, self._force = np.zeros(3), np.zeros(3), np.array((0.0, 0.0, GRAVITY))
         self._per_command = airframe.motor_thrust_max / FULL_COMMAND  # N
@@ -81,7 +81,7 @@ class VirtualCrazyflie:
         return self._locked
 
     def inject(self, fault: VehicleFault) -> None:
-        """Let something go wrong; its start counts from now.
+        """Add a fault; its start counts from now.
 
         Raises InputError for a fault of the firmware, if this one does not simulate any.
         """

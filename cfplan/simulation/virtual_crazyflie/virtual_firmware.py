@@ -1,4 +1,4 @@
-"""cfplan's own model of the firmware: it takes packets and what sensors measure, and returns packets and commands."""
+"""cfplan's own model of the firmware: from packets and measurements to packets and motor commands."""
 
 from collections.abc import Callable, Mapping, Set
 from functools import partial
@@ -70,7 +70,7 @@ class VirtualFirmware:
         self._boot(0)
 
     def _boot(self, answers_from: int) -> None:
-        """Start the processor: everything is as after switching on, and it answers from a tick on."""
+        """Start the processor: everything is as after power-on, and it answers from a tick on."""
         airframe, without = self._airframe, lacking(self.settings.version)
         self._tick = 0  # ms since power on
         self._answers_from = answers_from

@@ -29,12 +29,12 @@ class ViconSettings:
     rate: float = 100.0  # Hz
     position_noise: float = 0.001  # m, standard deviation of each axis
     attitude_noise: float = math.radians(0.2)  # rad, standard deviation about each axis
-    latency: float = 0.010  # s from the moment of a pose to its leaving
-    announced_latency: float | None = None  # s, what the server says about itself; None: the truth
+    latency: float = 0.010  # s from the moment of a pose to its transmission
+    announced_latency: float | None = None  # s, as reported by the server; None: the true one
     origin: Triple = (0.0, 0.0, 0.0)  # m, of the markers' body, from the vehicle's centre of mass in body axes
     mounting: Triple = (0.0, 0.0, 0.0)  # rad, rotation vector that turns the vehicle's axes into the markers' body's
     y_up: bool = False
-    spare: bool = False  # do not repeat what has not changed
+    spare: bool = False  # omit data that has not changed
     port: int = 0  # 0 takes a free one
     first_frame: int = 1000
     faults: tuple[ViconFault, ...] = ()  # from the server's start
@@ -85,11 +85,11 @@ class Cameras:
         return bool(self._faults.all)
 
     def inject(self, fault: ViconFault, now: float) -> None:
-        """Let something go wrong; its start counts from now."""
+        """Add a fault; its start counts from now."""
         self._faults.add(fault, now)
 
     def heal(self, now: float) -> None:
-        """Let everything that went wrong be right again."""
+        """End all faults."""
         self._faults.end(now)
 
     def look(

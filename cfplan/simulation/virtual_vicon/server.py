@@ -55,7 +55,7 @@ class Picture:
 
 
 class Connection:
-    """One client. With `spare`, what has not changed is not sent again."""
+    """One client. With `spare`, data that has not changed is omitted."""
 
     def __init__(self, client: socket.socket, *, spare: bool):
         client.setblocking(False)

@@ -118,11 +118,11 @@ class Served:
         return f"{system}://{_HOST}:{self.vicon.port}/{subject}"
 
     def inject(self, fault: ViconFault) -> None:
-        """Let something go wrong; its start counts from now."""
+        """Add a fault; its start counts from now."""
         self._wishes.append(lambda now: self.vicon.inject(fault, now))
 
     def heal(self) -> None:
-        """Let everything that went wrong be right again."""
+        """End all faults."""
         self._wishes.append(self.vicon.heal)
 
     def step(self) -> float:

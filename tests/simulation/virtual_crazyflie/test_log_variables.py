@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from cfplan.flight.radio.crtp import LARGEST_PAYLOAD, Port, pack
-from cfplan.simulation.virtual_crazyflie.log_blocks import MOST_BYTES, log_toc
+from cfplan.simulation.virtual_crazyflie.log_blocks import MAX_BYTES, log_toc
 from cfplan.simulation.virtual_crazyflie.parameters import parameter_toc
 from cfplan.simulation.virtual_crazyflie.toc import make_toc
 
@@ -201,7 +201,7 @@ def test_bad_blocks_have_the_firmwares_error_codes(rig):
     assert create(rig, 3, "pm.vbatMV", kind=UINT16, command=7) == errno.E2BIG
     log_command(rig, 3, 3, 1)
     rig.run(0.05)
-    assert max(len(packet) for packet in data_packets(rig)) == 1 + 4 + MOST_BYTES
+    assert max(len(packet) for packet in data_packets(rig)) == 1 + 4 + MAX_BYTES
 
 
 def test_there_are_sixteen_blocks_and_no_more(rig):
@@ -217,7 +217,7 @@ def test_a_variable_can_be_fetched_in_another_type(rig):
 
 def logged_now(rig, *names):
     """{name: value as it is logged}, and what the vehicle believes at that moment."""
-    blocks = [names[first : first + MOST_BYTES // 4] for first in range(0, len(names), MOST_BYTES // 4)]
+    blocks = [names[first : first + MAX_BYTES // 4] for first in range(0, len(names), MAX_BYTES // 4)]
     for number, block in enumerate(blocks):
         assert create(rig, number, *block) == 0
         log_command(rig, 3, number, 1)
