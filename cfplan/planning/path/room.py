@@ -14,7 +14,7 @@ _LINK_LOSS_CLEARANCE = 0.15  # m, added to the margin of obstacles if link loss 
 _MOVED = 1e-6  # m, step of finite differences
 
 
-class Faces(NamedTuple):
+class RoomFaces(NamedTuple):
     """The walls and obstacles of a room, for compiled code."""
 
     low: NDArray  # (3,) m, corners of the walls less their margin
@@ -57,12 +57,12 @@ class Room:
         return np.asarray(aside - (np.inf if self.corridor is None else self.corridor))
 
     @property
-    def faces(self) -> Faces:
+    def faces(self) -> RoomFaces:
         """Return the walls and obstacles."""
         space = self.space
         prisms = np.array([each.prism for each in space.obstacles]).reshape(-1, 8)
         low, high = np.array(space.low) + space.margin, np.array(space.high) - space.margin
-        return Faces(low, high, prisms, space.margin + self.beside)
+        return RoomFaces(low, high, prisms, space.margin + self.beside)
 
     def penalty(self, positions: NDArray, leg: NDArray, reserve: float) -> tuple[NDArray, NDArray]:
         """Return how far each clearance falls below `reserve`, m, squared, (P,) m², and the gradient, (P, 3) m.
@@ -82,7 +82,7 @@ class Room:
 
 
 @njit(error_model="numpy")
-def _penalties(positions: NDArray, faces: Faces, reserve: float) -> tuple[NDArray, NDArray]:
+def _penalties(positions: NDArray, faces: RoomFaces, reserve: float) -> tuple[NDArray, NDArray]:
     squares, gradient = np.empty(len(positions)), np.zeros_like(positions)
     for n in range(len(positions)):
         squares[n] = penalty_of(positions[n], gradient[n], faces, reserve)
@@ -90,7 +90,7 @@ def _penalties(positions: NDArray, faces: Faces, reserve: float) -> tuple[NDArra
 
 
 @njit(error_model="numpy")
-def penalty_of(position: NDArray, gradient: NDArray, faces: Faces, reserve: float) -> float:
+def penalty_of(position: NDArray, gradient: NDArray, faces: RoomFaces, reserve: float) -> float:
     """Return how far the clearances of a position, (3,) m, fall below `reserve`, squared, m²; add its gradient."""
     squares = 0.0
     for axis in range(3):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cfplan.geometry.min_snap import solve_derivatives
 from cfplan.geometry.min_snap_gradient import BASES, ends_of, gradient_by_ends
 from cfplan.machine_code import njit
-from cfplan.planning.path.room import Faces, Room, penalty_of
+from cfplan.planning.path.room import RoomFaces, Room, penalty_of
 from cfplan.planning.path.variables import TIME_UNIT, ChoiceVariables, Knots
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
@@ -43,7 +43,7 @@ class _Terms(NamedTuple):
     known: int  # 1 if the path begins with all of these; 0: at rest
     moving: NDArray  # (Q,) int, points that may move
     units: NDArray  # (Q,) m, a unit of the variables of each
-    faces: Faces
+    faces: RoomFaces
     speed: float  # m/s, above which the penalty begins; likewise those below
     acceleration: float  # m/s²
     specific_thrust: float  # m/s²
