@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cfplan.geometry.min_snap import solve_derivatives
 from cfplan.geometry.min_snap_gradient import BASES, ends_of, gradient_by_ends
 from cfplan.machine_code import njit
-from cfplan.planning.path.room import RoomFaces, Room, penalty_of
+from cfplan.planning.path.room import Room, RoomFaces, penalty_of
 from cfplan.planning.path.variables import TIME_UNIT, ChoiceVariables, Knots
 from cfplan.safety.limits import Limits
 from cfplan.vehicle.airframe import GRAVITY
