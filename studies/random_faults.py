@@ -24,6 +24,7 @@ from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
 from cfplan.geometry.random_paths import random_waypoints
+from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import prepare_flight
 from cfplan.simulation.lab.lab import Fault
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
@@ -39,6 +40,7 @@ from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
 _LENGTH, _SPREAD = 0.5, 1.2  # median, s, and standard deviation of the logarithm of a fault's duration
+PATIENT = FlightOptions(budget=60.0)  # so that the plans are the same on a computer with other work
 _FRACTION_FOR_GOOD = 0.1  # of the faults: they never end
 _FRACTION_DEAD = 0.4  # of the flights: the pilot or the radio dies
 _MANY = (0.5, 0.3, 0.2)  # fraction of flights with one, two, three faults
@@ -163,7 +165,7 @@ def prepare_missions(path_files: Sequence[Path], random_paths: int = 0) -> dict[
 
     Random paths that are refused are left out. Raises what preparing raises for the others.
     """
-    missions = {file.stem: prepare_flight(file, limits_for(file)).mission for file in path_files}
+    missions = {file.stem: prepare_flight(file, limits_for(file), PATIENT).mission for file in path_files}
     limits = limits_for(path_files[0])
     space = limits.space
     box = np.array([np.array(space.low) + space.margin, np.array(space.high) - space.margin])
@@ -175,7 +177,7 @@ def prepare_missions(path_files: Sequence[Path], random_paths: int = 0) -> dict[
             points = random_waypoints(seed, box, (2, 3)).round(3).tolist()
             file.write_text(f"name: {file.stem}\nwaypoints: {points}\n", encoding="utf-8")
             with contextlib.suppress(InfeasibleError, NotCertifiedError):
-                missions[file.stem] = prepare_flight(file, limits).mission
+                missions[file.stem] = prepare_flight(file, limits, PATIENT).mission
     return missions
 
 

@@ -28,9 +28,9 @@ _UpToOne = Annotated[float, Gt(0.0), Le(1.0)]
 class PlanLimits:
     """Limits of planned motion, everywhere on the path; all positive. quantities.py defines how each is computed."""
 
-    speed: Encodable  # m/s, norm
-    acceleration: Encodable  # m/s², norm, gravity not counted
-    angular_velocity: Encodable  # rad/s, norm of the body rates
+    speed: float  # m/s, norm
+    acceleration: float  # m/s², norm, gravity not counted
+    angular_velocity: float  # rad/s, norm of the body rates
     tilt: Tilt  # rad, between the thrust axis and the vertical
     motor_thrust_min: float  # N, each motor
     motor_thrust_max: float  # N, each motor, less the reserve for feedback

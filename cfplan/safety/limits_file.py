@@ -84,7 +84,8 @@ _SafetyFile: Any = schema_of(
     airframe=None,  # it has a file of its own
     vehicle=Annotated[str, Len(1, 200)],
     plan=schema_of(
-        PlanLimits, angular_acceleration=Positive, motor_thrust_min=None, motor_thrust_max=None,
+        PlanLimits, speed=Encodable, acceleration=Encodable, angular_velocity=Encodable,
+        angular_acceleration=Positive, motor_thrust_min=None, motor_thrust_max=None,
         specific_thrust_min=None, motor_reserve=Annotated[float, Gt(0.0), Lt(0.5)], specific_thrust=Positive,
     ),
     space=_Space,

@@ -9,7 +9,6 @@ import pytest
 
 from cfplan.flight.firmware import gains_for
 from cfplan.flight.setpoints.packets import decode, encode
-from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.engine.flight import Conditions, EstimateErrors, fly_setpoints
@@ -26,6 +25,7 @@ from cfplan.simulation.glitches import (
     glitch_at_sampled_setpoints,
     glitch_near_critical_setpoints,
 )
+from studies.random_faults import PATIENT
 
 REPOSITORY = Path(__file__).parents[2]
 LATE = Conditions(estimate=EstimateErrors(latency=LATENCY))
@@ -44,8 +44,7 @@ def with_spread(limits, **spread):
 
 @pytest.fixture(scope="module")
 def line(limits):
-    slowly = FlightOptions(budget=60.0)  # so that the plan is the same on a computer with other work
-    return prepare_mission(REPOSITORY / "flights" / "line.yaml", limits, slowly).payloads
+    return prepare_mission(REPOSITORY / "flights" / "line.yaml", limits, PATIENT).payloads
 
 
 @pytest.fixture(scope="module")

@@ -80,7 +80,7 @@ def continued(flown, committed, number, waypoints, limits):
 @pytest.fixture(scope="module")
 def spliced(flown, committed, limits):
     """A flight and the proposal that makes it, with the splice at setpoint 120."""
-    joined, setpoints = continued(flown, committed, 120, [[0.2, 1.0, 1.0], [-1.0, 2.4, 1.1]], limits)
+    joined, setpoints = continued(flown, committed, 120, [[0.2, 1.0, 1.3], [-1.0, 2.4, 1.0]], limits)
     return joined, propose(committed, 120, setpoints.payloads, stops_of(setpoints))
 
 
