@@ -46,7 +46,7 @@ class Failing(Counting):
 
 
 class Reversed(Counting):
-    """One that is told from cfplan's own by its echo, which is reversed."""
+    """A firmware whose echo is reversed, to distinguish it from cfplan's own."""
 
     def sent(self):
         return [packet[:1] + packet[:0:-1] for packet in super().sent()]

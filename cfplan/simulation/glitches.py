@@ -33,7 +33,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import tilt_of
 
 GAP = 0.2  # s without setpoints, without poses
-LATENCY = 0.010  # s by which the estimate is late; in dry runs positions are up to 6 and velocities up to 9 ms late
+LATENCY = 0.010  # s, lateness of the estimate; in dry runs positions are up to 6 and velocities up to 9 ms late
 AFTERWARDS = 2.0  # s simulated after the gap: at little thrust a vehicle may stray for 1.5 s until it is lost
 TURNED_OVER = math.radians(80.0)  # of tilt
 KINDS = ("setpoints", "poses", "setpoints and poses")

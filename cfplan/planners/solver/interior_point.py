@@ -92,7 +92,7 @@ class Search:
 
 
 class Multipliers(NamedTuple):
-    """Slacks and multipliers at the end of a search, from which another can continue."""
+    """Slacks and multipliers at the end of a search, to warm-start another."""
 
     bounds: NDArray  # (5, m) of that search
     slacks: NDArray  # (3, m) with their multipliers

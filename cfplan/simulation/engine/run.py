@@ -84,7 +84,7 @@ class Schedule(NamedTuple):
     level_after: int = NEVER  # ms after which the vehicle levels out
     off_after: int = NEVER  # ms after which motors stop, for good; the simulation ends on the floor then
     spread: NDArray = np.zeros(1)  # (steps or 1,) m by which boxes are widened to the sides, after each step
-    latency: int = 0  # ms, a multiple of the step, by which estimated position and velocity are late
+    latency: int = 0  # ms, a multiple of the step, lateness of estimated position and velocity
     noise: NDArray = np.zeros((0, 6))  # (steps or 0, 6) m and m/s, of the estimate
     part: int = PART  # ms of motion per box, if there are several
 

@@ -1,4 +1,4 @@
-"""The interface of a virtual Crazyflie's firmware, by which another implementation can replace cfplan's own."""
+"""The firmware interface of the virtual Crazyflie; another implementation can replace cfplan's own."""
 
 from collections.abc import Sequence, Set
 from typing import Protocol, runtime_checkable

@@ -26,7 +26,7 @@ class Variable:
 
 @dataclass(frozen=True, slots=True)
 class Toc:
-    """A table with the checksum by which clients cache it."""
+    """A table with its checksum, the key of clients' caches."""
 
     variables: tuple[Variable, ...]
     checksum: int

@@ -92,7 +92,7 @@ class VirtualFirmware:
         self.setpoint = Setpoint()  # what the controller is given
         self._attitude_setpoints = AttitudeSetpoints()
         self._out: list[bytes] = []
-        # to writes of parameters, each with the tick from which it may leave
+        # to writes of parameters, each with the earliest tick at which it may leave
         self._answers: list[tuple[int, bytes]] = []
         self.log = LogBlocks(self.log_variables(), without=without)
         self._avoidance = CollisionAvoidance()
