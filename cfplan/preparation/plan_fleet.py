@@ -184,7 +184,7 @@ def coordinate_fleet(
             raise InfeasibleError(
                 f"no start delays and clock rates keep {model.clearance:.2f} m from a lost vehicle: {losses[0]}",
                 where=fleet.name,
-                hint=_LOST_HINT,
+                hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each its own dongle, {_LOST_HINT}",
             )
     return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
 

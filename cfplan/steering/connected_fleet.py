@@ -25,6 +25,7 @@ from cfplan.errors import (
 )
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
+from cfplan.flight.fleet.dongle_process import SharedDongles
 from cfplan.flight.fleet.fly_together import FleetOutcome, FleetPilot, Listen, fly_together
 from cfplan.flight.mocap.poses import PoseSource
 from cfplan.flight.mocap.source import pose_source
@@ -137,11 +138,16 @@ class ConnectedFleet:
         self._conductor = Conductor(flights, self.plan.apart, holds=True)
 
     def _start_pilots(self, addresses: dict[str, VehicleAddress]) -> dict[str, PilotProcess]:
+        """Start the pilots, after the processes of the dongles that they share, which end after them."""
+        shared = {name: address.uri for name, address in addresses.items() if address.dongle}
         with main_module_hidden():
-            return {
-                name: self._open.enter_context(start_pilot([SimDriver] if address.virtual else []))
-                for name, address in addresses.items()
-            }
+            dongles = self._open.enter_context(SharedDongles(shared))
+            pilots = {}
+            for name, address in addresses.items():
+                drivers = dongles.drivers(name) if address.dongle else [SimDriver] if address.virtual else []
+                pilots[name] = self._open.enter_context(start_pilot(drivers))
+            dongles.hand_over()
+        return pilots
 
     def _pose_sources(self, on_step: OnStep) -> dict[str, PoseSource]:
         """Return the poses of each vehicle, after starting the room of virtual ones."""
@@ -290,7 +296,9 @@ class ConnectedFleet:
             self._listen(name, message)
 
         pilots = [
-            FleetPilot(flight, each.prepared.mission, each.address.uri, self._poses[each.name], self._pilots[each.name])
+            FleetPilot(
+                flight, each.prepared.mission, each.address.pilot_uri, self._poses[each.name], self._pilots[each.name]
+            )
             for flight, each in zip(self._conductor.flights, self.vehicles, strict=True)
         ]
         try:

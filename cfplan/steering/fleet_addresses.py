@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from urllib.parse import quote
 
 from cfplan.errors import InputError
+from cfplan.flight.fleet.dongle_process import shared_uri
+from cfplan.flight.fleet.inline_radio import INLINE, dongle_mode, require_capacity, require_inline_settings
 from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
+from cfplan.flight.radio.crazyradio import find_radios
 from cfplan.flight.radio.uri import check_vehicle_uri
 from cfplan.planning.fleet.fleet_file import FleetFile
-from cfplan.preparation.steps import OnStep
+from cfplan.preparation.steps import OnStep, step
 from cfplan.safety.limits import PoseLimits
 from cfplan.steering.starting_vehicle import SIMULATED, look_at_hardware
 
@@ -20,6 +23,12 @@ class VehicleAddress:
     uri: str
     body: str
     mocap: str = ""  # URI of the body; empty in a virtual room, which has a virtual Vicon
+    dongle: str = ""  # the number of the dongle that it shares with others; empty if it shares none
+
+    @property
+    def pilot_uri(self) -> str:
+        """Return the URI by which its pilot reaches it."""
+        return shared_uri(self.uri) if self.dongle else self.uri
 
     @property
     def virtual(self) -> bool:
@@ -33,8 +42,8 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAdd
         fleet: the vehicles. One without `body` has its name as its body.
         mocap: the motion capture system that sees all of them, as vicon://192.168.1.2; None for virtual vehicles.
 
-    Raises InputError if a URI is wrong, two vehicles have one address or one body, two share a dongle, some are virtual
-    and some are not, or they have no motion capture. Nothing is connected yet.
+    Raises InputError if a URI is wrong, two vehicles have one address or one body, too many share a dongle, some are
+    virtual and some are not, or they have no motion capture. Nothing is connected yet.
     """
     uris = {vehicle.name: vehicle.uri or f"{SIMULATED}{number}" for number, vehicle in enumerate(fleet.vehicles)}
     bodies = {vehicle.name: vehicle.body or vehicle.name for vehicle in fleet.vehicles}
@@ -43,21 +52,31 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAdd
     _require_all_virtual_or_none(fleet, mocap)
     _require_different("address", uris, fleet)
     _require_different("body", bodies, fleet)
+    dongles: dict[str, str] = {}
     for dongle, numbers in fleet.dongles.items():
         sharing = [fleet.vehicles[number].name for number in numbers]
-        raise InputError(
-            f"{' and '.join(sharing)} share dongle {dongle}, which serves one vehicle",
-            where=uris[sharing[1]],
-            hint="plug in a dongle for each vehicle, and number them 0, 1, … after radio://",
-        )
-    return {name: VehicleAddress(uri, bodies[name], _body_uri(mocap, bodies[name])) for name, uri in uris.items()}
+        for name in sharing:
+            require_inline_settings(uris[name])
+        require_capacity(dongle, sharing, INLINE)
+        dongles |= dict.fromkeys(sharing, dongle)
+    return {
+        name: VehicleAddress(uri, bodies[name], _body_uri(mocap, bodies[name]), dongles.get(name, ""))
+        for name, uri in uris.items()
+    }
 
 
 def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, on_step: OnStep) -> None:
-    """Check that each dongle is available and each body seen, before anything is planned. Raises a CfplanError."""
+    """Check that each dongle is available and carries its vehicles, and that each body is seen, before planning.
+
+    Raises a CfplanError.
+    """
     for name, address in addresses.items():
         if not address.virtual:
             look_at_hardware(address.uri, address.mocap, limits, _named(name, on_step))
+    for dongle in dict.fromkeys(address.dongle for address in addresses.values() if address.dongle):
+        with step(on_step, f"dongle {dongle}") as results:
+            sharing = [name for name, address in addresses.items() if address.dongle == dongle]
+            results.append(require_capacity(dongle, sharing, dongle_mode(find_radios()[int(dongle)].bcdDevice)))
 
 
 def _named(name: str, on_step: OnStep) -> OnStep:

@@ -1,0 +1,153 @@
+"""One Crazyradio for several vehicles: which packet it transmits next, and to which vehicle.
+
+Vehicles with a packet take turns; the one that was served longest ago is next. If none has a packet, vehicles are
+polled, as their packets come with acknowledgements. A vehicle that does not acknowledge is tried more seldom, so that
+it does not take the time of the others.
+
+Safelink and packets that perish are as in radio/dongle.py. Of each vehicle one setpoint and one pose wait: the newest.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+from cfplan.errors import LinkError
+from cfplan.flight.clock import Clock
+from cfplan.flight.firmware import Timeouts
+from cfplan.flight.fleet.inline_radio import RadioAddress
+from cfplan.flight.radio.crtp import NULL_PACKET, Port
+from cfplan.flight.radio.dongle import DEAD_AFTER
+from cfplan.flight.radio.perishable import MAX_AGE, Outbox, is_perishable
+
+PACE = 0.002  # s, least time between packets to one vehicle, whose radio queue holds 5
+RADIO_DEAD_AFTER = Timeouts().motors_off  # s without a report of the radio; no vehicle flies on then
+_POLL_PERIOD, _QUICK_POLLS = 0.01, 3  # s between polls; after a packet came, that many polls follow at the pace
+_LONGEST_BACK_OFF = 0.03  # s between attempts to reach a vehicle that acknowledges nothing
+_MOST_WAITING = 16  # packets of one vehicle
+_NO_REPORT_PAUSE = 0.001  # s; an unplugged radio fails at once
+_SAFELINK, _SAFELINK_ATTEMPTS = bytes((0xFF, 0x05, 0x01)), 10  # see radio/dongle.py
+_PING = Port.LINK << 4  # header of a ping, without the counters
+_UP, _DOWN = 3, 2  # bits of the counters in the header
+_COUNTERS = 1 << _UP | 1 << _DOWN
+
+
+class SharedRadio(Protocol):
+    """A radio that transmits each packet to another vehicle."""
+
+    def exchange(self, to: RadioAddress, frame: bytes) -> bytes | None:
+        """Transmit; return the content of the acknowledgement, None without one. Raises OSError without a report."""
+
+    def close(self) -> None:
+        """Let go of the radio."""
+
+
+class SharedVehicle:
+    """A vehicle of a shared dongle: its waiting packets, and the state of its link."""
+
+    def __init__(self, address: RadioAddress, hear: Callable[[bytes], None], fail: Callable[[str], None]):
+        """`hear` gets each packet of the vehicle, and `fail` why its link is lost."""
+        self.address, self.hear, self.fail = address, hear, fail
+        self.open = False
+        self.served = 0.0  # s, when it had its last turn
+
+    def begin(self, now: float, *, safelink: bool = True) -> None:
+        """Open the link. Without safelink, `hear` also gets empty acknowledgements."""
+        self.open, self.acknowledged = True, now
+        self._outbox, self._waiting = Outbox(), dict[bytes, tuple[float, bytes]]()
+        self._asks = _SAFELINK_ATTEMPTS if safelink else 0  # for safelink, that are left
+        self._plain, self._safelink = not safelink, False
+        self._up = self._down = self._failures = self._empty = 0
+        self._next = self._poll = now  # s, when it may be served, and when it is polled
+
+    def put(self, packet: bytes, sent: float) -> None:
+        """Add a packet that its pilot sent at a time, s; it replaces an older one of its kind, in its place in line."""
+        newest = is_perishable(packet) or packet[0] & ~_COUNTERS == _PING
+        self._waiting.pop(kind := packet[:1] if newest else packet, None)
+        self._waiting[kind] = sent, packet
+        if len(self._waiting) > _MOST_WAITING:
+            del self._waiting[next(iter(self._waiting))]
+
+    def turn(self, now: float) -> float:
+        """Return when, s, its next turn is: a time that has passed if it is now."""
+        for kind, (sent, packet) in list(self._waiting.items()):
+            if now - sent > MAX_AGE and is_perishable(packet):
+                del self._waiting[kind]
+        return self._next if self.has_packet else max(self._next, self._poll)
+
+    @property
+    def has_packet(self) -> bool:
+        """Return whether a packet waits, or is repeated until it is acknowledged."""
+        return bool(self._waiting) or not self._outbox.empty
+
+    def frame(self, now: float) -> bytes:
+        """Return what to transmit."""
+        self.served = now
+        if self._asks:
+            return _SAFELINK
+        if self._outbox.empty and self._waiting:
+            sent, packet = self._waiting.pop(next(iter(self._waiting)))
+            self._outbox.put(packet, sent)
+        header, *rest = self._outbox.transmission(now)
+        if self._safelink:
+            header = header & ~_COUNTERS | self._up << _UP | self._down << _DOWN
+        return bytes((header, *rest))
+
+    def unanswered(self, now: float) -> None:
+        """Note that the frame was not acknowledged."""
+        self._failures += 1
+        self._next = now + min(PACE * self._failures, _LONGEST_BACK_OFF)
+        if now - self.acknowledged > DEAD_AFTER:
+            self.open = False
+            self.fail("the vehicle acknowledges nothing")
+
+    def answered(self, content: bytes, now: float) -> None:
+        """Note the acknowledgement of the frame, with its content."""
+        self.acknowledged, self._failures, self._next = now, 0, now + PACE
+        if self._asks:
+            self._safelink = content == _SAFELINK
+            self._asks = 0 if self._safelink else self._asks - 1
+            return
+        self._outbox.acknowledged()
+        self._up = 1 - self._up
+        if content and content[0] >> _DOWN & 1 == self._down:
+            self._down = 1 - self._down
+        empty = not content or content[0] | _COUNTERS == NULL_PACKET[0]
+        self._empty = self._empty + 1 if empty else 0
+        self._poll = now + (_POLL_PERIOD if self._empty > _QUICK_POLLS else PACE)
+        if self._plain or not empty:
+            self.hear(content or NULL_PACKET)
+
+
+class SharedDongle:
+    """Gives each vehicle its turns."""
+
+    def __init__(self, radio: SharedRadio, vehicles: Sequence[SharedVehicle], clock: Clock):
+        self._radio, self._vehicles, self._clock = radio, vehicles, clock
+        self._reported = clock.now()
+
+    def serve(self) -> float:
+        """Give one vehicle its turn; return how long, s, until the next one is due.
+
+        Raises LinkError if the radio has not reported for RADIO_DEAD_AFTER.
+        """
+        now = self._clock.now()
+        vehicles = [(each, each.turn(now)) for each in self._vehicles if each.open]
+        due = [each for each, turn in vehicles if turn <= now]
+        if due:
+            self._exchange(min(due, key=lambda each: (not each.has_packet, each.served)), now)
+            return 0.0
+        return min((turn for _, turn in vehicles), default=now + _POLL_PERIOD) - now
+
+    def _exchange(self, vehicle: SharedVehicle, now: float) -> None:
+        try:
+            content = self._radio.exchange(vehicle.address, vehicle.frame(now))
+        except OSError as error:  # a pyusb error is one
+            if self._clock.now() - self._reported > RADIO_DEAD_AFTER:
+                raise LinkError(f"the Crazyradio does not answer: {error}", hint="unplug it, and plug it in") from error
+            self._clock.sleep(_NO_REPORT_PAUSE)
+            content = None
+        else:
+            self._reported = self._clock.now()
+        if content is None:
+            vehicle.unanswered(self._clock.now())
+        else:
+            vehicle.answered(content, self._clock.now())

@@ -1,0 +1,145 @@
+"""The process of a shared dongle: pilots reach their vehicles through it, and notice if it dies or hangs."""
+
+import os
+import signal
+from functools import partial
+
+import pytest
+from cflib.crtp.crtpstack import CRTPPacket
+from inline_crazyradio import absent_radio, radio_of_echoing_vehicles, unmarked
+from waiting import a_moment, until
+
+from cfplan.errors import InputError, LinkError
+from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
+from cfplan.flight.fleet.inline_radio import dongle_mode, require_capacity
+from cfplan.flight.radio.radio_lock import lock_radio
+
+URIS = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(("left", "right"), start=1)}
+
+
+@pytest.fixture(autouse=True)
+def _own_locks(monkeypatch, tmp_path):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+
+
+class Pilot:
+    """A pilot's link, and what it hears."""
+
+    def __init__(self, dongles: SharedDongles, name: str, options: str = ""):
+        (make,) = dongles.drivers(name)
+        self.link, self.failures = make(), []
+        self.link.connect(shared_uri(URIS[name]) + options, None, self.failures.append)
+
+    def answer_to(self, *content: int) -> bytes | None:
+        """Send a packet until it comes back; None if the link is lost."""
+        while not self.failures:
+            self.link.send_packet(CRTPPacket(0x2E, bytearray(content)))
+            packet = self.link.receive_packet(0.2)
+            if packet is not None and bytes(packet.data) == bytes(content):
+                return unmarked((packet.header, *packet.data))
+        return None
+
+    def loses_its_link(self) -> bool:
+        return until(lambda: self.link.receive_packet(0.05) is None and self.failures)
+
+
+@pytest.fixture
+def dongles():
+    with SharedDongles(URIS, radio_of_echoing_vehicles) as dongles:
+        yield dongles
+
+
+def pid(dongles) -> int:
+    return dongles.processes["0"].pid
+
+
+def test_two_pilots_reach_each_its_vehicle_and_no_other(dongles):
+    left, right = Pilot(dongles, "left"), Pilot(dongles, "right")
+    for number in range(5):
+        assert left.answer_to(1, number) == bytes((0x2E, 1, number))
+        assert right.answer_to(2, number) == bytes((0x2E, 2, number))
+    with pytest.raises(LinkError, match="another cfplan"):
+        lock_radio("radio://0/90/2M")
+
+
+def test_each_pilot_loses_its_link_at_once_when_the_process_dies(dongles):
+    pilots = [Pilot(dongles, name) for name in URIS]
+    os.kill(pid(dongles), signal.SIGKILL)
+    for pilot in pilots:
+        assert pilot.loses_its_link()
+        assert pilot.failures == ["the dongle's process has ended"]
+        pilot.link.send_packet(CRTPPacket(0x2E, bytearray(b"\1")))  # is dropped
+        with pytest.raises(LinkError, match="has ended"):
+            pilot.link.connect("shared://0", None, None)
+
+
+def test_each_pilot_loses_its_link_when_the_process_hangs(dongles, monkeypatch):
+    monkeypatch.setattr("cfplan.flight.fleet.dongle_process.DONGLE_SILENT", 1.0)
+    pilots = [Pilot(dongles, name) for name in URIS]
+    os.kill(pid(dongles), signal.SIGSTOP)
+    try:
+        for pilot in pilots:
+            assert pilot.loses_its_link()
+            assert "silent" in pilot.failures[0]
+            for _ in range(10_000):  # never waits for the process, however much it holds
+                pilot.link.send_packet(CRTPPacket(0x2E, bytearray(b"\1")))
+    finally:
+        os.kill(pid(dongles), signal.SIGCONT)
+
+
+def test_the_process_survives_the_signals_that_end_a_session_and_pilots_go_on(dongles):
+    pilot = Pilot(dongles, "left")
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
+        os.kill(pid(dongles), number)
+    a_moment()
+    assert pilot.answer_to(7) == b"\x2e\x07"
+
+
+def test_the_process_ends_with_its_last_pilot(dongles):
+    pilots = [Pilot(dongles, name) for name in URIS]
+    pilots[0].link.close()
+    assert pilots[1].answer_to(1)
+    dongles.hand_over()
+    assert until(lambda: not dongles.processes["0"].is_alive())
+    lock_radio("radio://0/80").close()
+
+
+def test_a_link_that_is_opened_again_hears_nothing_of_the_one_before(dongles):
+    pilot = Pilot(dongles, "left")
+    for number in range(20):
+        pilot.link.send_packet(CRTPPacket(0x2E, bytearray((number,))))
+    a_moment()
+    pilot.link.close()
+    again = Pilot(dongles, "left", "?safelink=0&autoping=0&ackfilter=0")
+    again.link.send_packet(CRTPPacket(0xFF, bytearray(b"\xfe\x02")))
+    assert again.link.receive_packet(1.0).header == 0xFF
+
+
+def test_a_radio_that_cannot_be_opened_is_an_error_of_each_pilot():
+    with SharedDongles(URIS, absent_radio) as dongles:
+        for name in URIS:
+            with pytest.raises(LinkError, match="Cannot find a Crazyradio"):
+                Pilot(dongles, name)
+
+
+@pytest.mark.parametrize(
+    ("count", "firmware", "parts"),
+    [
+        (2, 0x0501, None),
+        (4, 0x0504, None),
+        (5, 0x0510, ("need 1050", "carries 975", "enough for 4 vehicles")),
+        (2, 0x0500, ("need 420", "carries 225", "enough for 1 vehicle", "firmware 5.1")),
+        (2, 0x0053, ("USB set-up",)),  # a Crazyradio PA
+    ],
+)
+def test_a_dongle_short_of_capacity_is_refused_with_need_and_capacity(count, firmware, parts):
+    require = partial(require_capacity, "0", [f"cf{number}" for number in range(count)], dongle_mode(firmware))
+    if parts is None:
+        assert f"{210 * count} packets a second" in require()
+        return
+    with pytest.raises(InputError) as caught:
+        require()
+    for part in ("dongle 0", "cf0 and cf1", *parts):
+        assert part in str(caught.value)
+    assert caught.value.hint
