@@ -7,18 +7,21 @@ from functools import partial
 import pytest
 from cflib.crtp.crtpstack import CRTPPacket
 from inline_crazyradio import absent_radio, radio_of_echoing_vehicles, unmarked
-from waiting import a_moment, until
+from waiting import PATIENCE, a_moment, until
 
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
 from cfplan.flight.fleet.inline_radio import dongle_mode, require_capacity
 from cfplan.flight.radio.radio_lock import lock_radio
 
+pytestmark = pytest.mark.integration
+
 URIS = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(("left", "right"), start=1)}
 
 
 @pytest.fixture(autouse=True)
-def _own_locks(monkeypatch, tmp_path):
+def _patience_and_own_locks(monkeypatch, tmp_path):
+    monkeypatch.setattr("cfplan.flight.fleet.dongle_process.OPENS_WITHIN", PATIENCE)  # the process begins to run
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
