@@ -10,15 +10,19 @@ import subprocess
 import sys
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pages
 import pytest
+from inline_crazyradio import radio_of_virtual_vehicles
 from septic_flight import septic_payloads
+from waiting import until
 
 from cfplan.errors import ExitCode, FlightEndedError, InputError, RequestRefusedError
 from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
+from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
 from cfplan.flight.fleet.fly_together import FleetPilot, fly_together
 from cfplan.flight.pilot.keys import Keyboard
 from cfplan.flight.pilot.mission import Mission
@@ -40,6 +44,7 @@ LIMITS = replace(  # the computer that runs tests stands still now and then
     SHIPPED, pose=replace(SHIPPED.pose, age_brake=0.5, age_land=1.5), lateness=0.1
 )
 NAMES = ("left", "right")
+DOWN = 0.05  # m
 
 
 def mission(y: float) -> Mission:
@@ -49,8 +54,12 @@ def mission(y: float) -> Mission:
     return Mission(payloads, encode_stops(decode(payloads), 100.0), LIMITS, hold_time=0.5)
 
 
-def fly_two(react=lambda name, message, pilots: None):
-    """Fly two vehicles side by side; return the outcome and the truth of each."""
+def fly_two(react=lambda name, message, pids: None, *, dongle: bool = False):
+    """Fly two vehicles side by side; return the outcome and the truth of each, once both are down.
+
+    With `dongle` they share a Crazyradio, which is simulated at the level of USB. `react` hears of everything, and gets
+    the numbers of processes: of pilots by their vehicles' names, and of the "dongle".
+    """
     missions = {name: mission(0.6 * number) for number, name in enumerate(NAMES)}
     places = [
         VehiclePlace(f"sim://{number}", name, missions[name].start[0][:2], missions[name].start[1])
@@ -58,30 +67,43 @@ def fly_two(react=lambda name, message, pilots: None):
     ]
     with ExitStack() as stack:
         room = stack.enter_context(FleetRoom(places, LIMITS))
-        processes = {name: stack.enter_context(start_pilot([SimDriver])) for name in NAMES}
+        uris, drivers = {place.body: place.uri for place in places}, {name: [SimDriver] for name in NAMES}
+        if dongle:
+            ports = dict(enumerate(room.lab.ports))
+            addresses = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(NAMES)}
+            shared = stack.enter_context(SharedDongles(addresses, partial(radio_of_virtual_vehicles, ports)))
+            uris = {name: shared_uri(address) for name, address in addresses.items()}
+            drivers = {name: shared.drivers(name) for name in NAMES}
+        processes = {name: stack.enter_context(start_pilot(drivers[name])) for name in NAMES}
+        pids = {name: pilot.process.pid for name, pilot in processes.items()}
+        if dongle:
+            shared.hand_over()
+            pids["dongle"] = shared.processes["0"].pid
         keyboard = stack.enter_context(Keyboard(keys=False))
         pilots = [
             FleetPilot(
-                ConductedFlight(place.body, missions[place.body].start[0], 0.0), missions[place.body], place.uri,
+                ConductedFlight(place.body, missions[place.body].start[0], 0.0), missions[place.body], uris[place.body],
                 room.poses(place.body), processes[place.body],
             )
             for place in places
         ]  # fmt: skip
         conductor = Conductor([pilot.flight for pilot in pilots], 0.3)
         outcome = fly_together(
-            pilots, conductor, listen=lambda name, message: react(name, message, processes), keyboard=keyboard
+            pilots, conductor, listen=lambda name, message: react(name, message, pids), keyboard=keyboard
         )
+        assert until(lambda: all(room.lab.truth(number).position[-1, 2] < DOWN for number in range(2)))
         return outcome, {name: room.lab.truth(number) for number, name in enumerate(NAMES)}
 
 
 def assert_down(truths):
     assert not contacts(truths, LIMITS.airframe)
     for truth in truths.values():
-        assert truth.position[-1, 2] < 0.05
+        assert truth.position[-1, 2] < DOWN
 
 
-def test_two_vehicles_start_together_and_land():
-    outcome, truths = fly_two()
+@pytest.mark.parametrize("dongle", [False, True], ids=["a link each", "one dongle"])
+def test_two_vehicles_start_together_and_land(dongle):
+    outcome, truths = fly_two(dongle=dongle)
     assert outcome.exit_code is ExitCode.OK, outcome.ends
     starts = [outcome.outcomes[name].first_setpoint for name in NAMES]
     assert max(starts) - min(starts) < 0.015
@@ -90,16 +112,30 @@ def test_two_vehicles_start_together_and_land():
     assert_down(truths)
 
 
-def test_the_other_brakes_when_the_process_of_a_pilot_is_killed():
+def kill_when_flying(which: str, number: signal.Signals = signal.SIGKILL):
+    """Return a reaction that kills a process once the vehicle `left` begins its path."""
     killed = False
 
-    def kill(name, message, pilots):
+    def kill(name, message, pids):
         nonlocal killed
         if name == "left" and isinstance(message, PhaseEntered) and message.phase is Phase.STREAM and not killed:
             killed = True
-            os.kill(pilots["left"].process.pid, signal.SIGKILL)
+            os.kill(pids[which], number)
 
-    outcome, truths = fly_two(kill)
+    return kill
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dies", "hangs"])
+def test_both_are_lost_and_come_down_when_the_process_of_their_dongle(number):
+    outcome, truths = fly_two(kill_when_flying("dongle", number), dongle=True)
+    for name in NAMES:
+        assert outcome.ends[name].exit_code is ExitCode.LINK_LOST, outcome.ends
+    assert outcome.brakes
+    assert_down(truths)
+
+
+def test_the_other_brakes_when_the_process_of_a_pilot_is_killed():
+    outcome, truths = fly_two(kill_when_flying("left"))
     assert outcome.ends["left"].exit_code is ExitCode.LINK_LOST
     assert "left" in outcome.ends["right"].reason
     assert outcome.exit_code is ExitCode.LINK_LOST
