@@ -12,6 +12,8 @@ from typing import NamedTuple
 from cfplan.air.core import PILOT_ANSWER_TIMEOUT
 from cfplan.errors import ExitCode
 from cfplan.flight.firmware import TIMEOUTS, Timeouts, version_text
+from cfplan.flight.fleet.dongle_process import DONGLE_SILENT
+from cfplan.flight.fleet.shared_dongle import RADIO_DEAD_AFTER
 from cfplan.flight.mocap.child import FRAME_ALARM
 from cfplan.flight.mocap.datastream_client import FRAME_TIMEOUT
 from cfplan.flight.mocap.feed import RESTART_BACKOFF
@@ -112,6 +114,9 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
                 "it hovers where it is, then lands there; no old setpoint is sent", "the pilot"),
         TimeOut("acknowledgements, for good", LINK_LOST_AFTER,
                 "the link counts as lost: exit code 8, the record is closed", "the pilot"),
+        TimeOut("the process of a dongle that vehicles of a fleet share", DONGLE_SILENT,
+                "its links count as lost; they are lost at once if the process dies", "each pilot"),
+        TimeOut("reports of that dongle by USB", RADIO_DEAD_AFTER, "its links count as lost", "the dongle's process"),
     ),
     "poses": (
         TimeOut("a pose, before take-off", POSE.age_warning, "preflight refuses", "the pilot", "pose.age_warning"),

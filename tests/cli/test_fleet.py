@@ -67,6 +67,10 @@ def test_the_vehicles_of_one_dongle_are_lost_together(cfplan, narrow_fleet, safe
     assert len(together) == 1
     assert together[0]["reaction"] == "all are lost"
     assert together[0]["distance"] < 0.2
+    file.write_text(file.read_text().replace("lost: warn", ""))
+    refused = cfplan("plan", file, "--safety", safety_file())
+    assert refused.code == 3
+    assert "own dongle" in " ".join(refused.err.split())
 
 
 def test_the_figure_of_a_fleet_has_its_paths_distances_and_conflict_map(cfplan, fleet_file, safety_file, tmp_path):

@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pages
@@ -44,6 +45,7 @@ LIMITS = replace(  # the computer that runs tests stands still now and then
     SHIPPED, pose=replace(SHIPPED.pose, age_brake=0.5, age_land=1.5), lateness=0.1
 )
 NAMES = ("left", "right")
+ADDRESSES = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(NAMES)}
 DOWN = 0.05  # m
 
 
@@ -70,9 +72,8 @@ def fly_two(react=lambda name, message, pids: None, *, dongle: bool = False):
         uris, drivers = {place.body: place.uri for place in places}, {name: [SimDriver] for name in NAMES}
         if dongle:
             ports = dict(enumerate(room.lab.ports))
-            addresses = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(NAMES)}
-            shared = stack.enter_context(SharedDongles(addresses, partial(radio_of_virtual_vehicles, ports)))
-            uris = {name: shared_uri(address) for name, address in addresses.items()}
+            shared = stack.enter_context(SharedDongles(ADDRESSES, partial(radio_of_virtual_vehicles, ports)))
+            uris = {name: shared_uri(address) for name, address in ADDRESSES.items()}
             drivers = {name: shared.drivers(name) for name in NAMES}
         processes = {name: stack.enter_context(start_pilot(drivers[name])) for name in NAMES}
         pids = {name: pilot.process.pid for name, pilot in processes.items()}
@@ -101,9 +102,8 @@ def assert_down(truths):
         assert truth.position[-1, 2] < DOWN
 
 
-@pytest.mark.parametrize("dongle", [False, True], ids=["a link each", "one dongle"])
-def test_two_vehicles_start_together_and_land(dongle):
-    outcome, truths = fly_two(dongle=dongle)
+def test_two_vehicles_start_together_and_land():
+    outcome, truths = fly_two()
     assert outcome.exit_code is ExitCode.OK, outcome.ends
     starts = [outcome.outcomes[name].first_setpoint for name in NAMES]
     assert max(starts) - min(starts) < 0.015
@@ -180,11 +180,24 @@ def narrow_room(folder: Path, *uris: str) -> Path:
     return folder / "fleet.yaml"
 
 
-def test_a_fleet_with_addresses_flies_by_the_poses_of_a_motion_capture_system(tmp_path):
+def put_in_place_of_a_crazyradio(monkeypatch, ports):
+    """Simulate a Crazyradio 2.0 with vehicles behind it at these ports, by the last bytes of their addresses."""
+    open_radio = partial(radio_of_virtual_vehicles, ports)
+    monkeypatch.setattr("cfplan.steering.connected_fleet.SharedDongles", partial(SharedDongles, open_radio=open_radio))
+    monkeypatch.setattr("cfplan.steering.fleet_addresses.find_radios", lambda: [SimpleNamespace(bcdDevice=0x0501)])
+    monkeypatch.setattr("cfplan.flight.radio.crazyradio.check_radio", lambda uri: None)
+
+
+@pytest.mark.parametrize("dongle", [False, True], ids=["a link each", "one dongle"])
+def test_a_fleet_with_addresses_flies_by_the_poses_of_a_motion_capture_system(tmp_path, monkeypatch, dongle):
     places = [VehiclePlace(f"sim://{number}", name, (0.0, float(number))) for number, name in enumerate(NAMES)]
     with FleetRoom(places, LIMITS) as room:
         mocap = room.lab.mocap_uri.rpartition("/")[0]
-        file = narrow_room(tmp_path, *(f"udp://127.0.0.1:{port}" for port in room.lab.ports))
+        uris = [f"udp://127.0.0.1:{port}" for port in room.lab.ports]
+        if dongle:
+            uris = list(ADDRESSES.values())
+            put_in_place_of_a_crazyradio(monkeypatch, dict(enumerate(room.lab.ports)))
+        file = narrow_room(tmp_path, *uris)
         with connect_fleet(file, mocap=mocap, safety=LIMITS, records=None) as fleet:
             with pytest.raises(InputError, match="take_off"):
                 fleet.fly()

@@ -34,7 +34,7 @@ from cfplan.flight.real_time import lock_memory, shorten_time_slice, use_fifo_sc
 SCHEME = "shared://"  # of a pilot's URI, in place of radio://
 DONGLE_SILENT = Timeouts().motors_off  # s without a message of the process: the link is lost, and no vehicle flies on
 _ALIVE_PERIOD = 0.2  # s between messages that say that the process is alive
-OPENS_WITHIN = 3.0  # s, for a Crazyradio to be opened
+_OPENS_WITHIN = 3.0  # s, for a Crazyradio to be opened
 _ENDS_WITHIN = 2.0  # s, after the last pilot
 _LONGEST_WAIT = 0.1  # s
 _LONGEST_MESSAGE = 1024
@@ -77,7 +77,7 @@ class SharedLink(CRTPDriver):
         if not uri.startswith(SCHEME):
             raise WrongUriType(f"not a {SCHEME} URI")
         _tell(self._end, _Kind.OPEN_PLAIN if "safelink=0" in uri else _Kind.OPEN)
-        until = time.monotonic() + OPENS_WITHIN
+        until = time.monotonic() + _OPENS_WITHIN
         kind = None
         while kind is not _Kind.OPENED:  # what came for an earlier link is discarded
             kind, content = self._receive(max(until - time.monotonic(), 0.0))

@@ -21,7 +21,7 @@ _HIGHEST_CHANNEL, _SLOWEST_RATE = 100, "250K"  # of a Crazyradio 2.0: it ignores
 _VENDOR_REQUEST, _SET_INLINE_MODE = 0x40, 0x23
 _OUT, _IN, _LONGEST_ANSWER = 0x01, 0x81, 64
 _ACKNOWLEDGE, _ACKNOWLEDGED = 0x10, 0x01  # bits: of the header's second byte, of the answer's second byte
-_TIMEOUT, _DRAIN_TIMEOUT = 100, 10  # ms; an exchange takes 1 ms, and 4 ms without an acknowledgement
+_TIMEOUT, _DRAIN_TIMEOUT = 100, 50  # ms; an exchange takes 1 ms, and 4 ms without an acknowledgement
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from cfplan.flight.radio.dongle import DEAD_AFTER
 from cfplan.flight.radio.perishable import MAX_AGE, Outbox, is_perishable
 
 PACE = 0.002  # s, least time between packets to one vehicle, whose radio queue holds 5
+NEVER_HEARD_AFTER = 3.0  # s without an acknowledgement since the link was opened
 RADIO_DEAD_AFTER = Timeouts().motors_off  # s without a report of the radio; no vehicle flies on then
 _POLL_PERIOD, _QUICK_POLLS = 0.01, 3  # s between polls; after a packet came, that many polls follow at the pace
 _LONGEST_BACK_OFF = 0.03  # s between attempts to reach a vehicle that acknowledges nothing
@@ -55,6 +56,7 @@ class SharedVehicle:
         self._outbox, self._waiting = Outbox(), dict[bytes, tuple[float, bytes]]()
         self._asks = _SAFELINK_ATTEMPTS if safelink else 0  # for safelink, that are left
         self._plain, self._safelink = not safelink, False
+        self._heard = False
         self._up = self._down = self._failures = self._empty = 0
         self._next = self._poll = now  # s, when it may be served, and when it is polled
 
@@ -95,13 +97,13 @@ class SharedVehicle:
         """Note that the frame was not acknowledged."""
         self._failures += 1
         self._next = now + min(PACE * self._failures, _LONGEST_BACK_OFF)
-        if now - self.acknowledged > DEAD_AFTER:
+        if now - self.acknowledged > (DEAD_AFTER if self._heard else NEVER_HEARD_AFTER):
             self.open = False
-            self.fail("the vehicle acknowledges nothing")
+            self.fail("the vehicle acknowledges nothing: is it on, and are channel, rate and address right?")
 
     def answered(self, content: bytes, now: float) -> None:
         """Note the acknowledgement of the frame, with its content."""
-        self.acknowledged, self._failures, self._next = now, 0, now + PACE
+        self.acknowledged, self._heard, self._failures, self._next = now, True, 0, now + PACE
         if self._asks:
             self._safelink = content == _SAFELINK
             self._asks = 0 if self._safelink else self._asks - 1

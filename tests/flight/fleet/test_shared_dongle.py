@@ -10,6 +10,7 @@ from cfplan.errors import LinkError
 from cfplan.flight.clock import SteppedClock
 from cfplan.flight.fleet.inline_radio import InlineRadio, RadioAddress
 from cfplan.flight.fleet.shared_dongle import PACE, RADIO_DEAD_AFTER, SharedDongle, SharedVehicle
+from cfplan.flight.radio.connection import FIRST_ANSWER_TIMEOUT
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.dongle import DEAD_AFTER
 from cfplan.flight.radio.perishable import MAX_AGE
@@ -188,7 +189,17 @@ def test_a_vehicle_that_is_off_for_long_is_lost_and_the_others_are_not():
     shared.run(DEAD_AFTER - 0.5)
     assert not shared.failures[0]
     shared.run(1.0)
-    assert shared.failures == [["the vehicle acknowledges nothing"], []]
+    assert len(shared.failures[0]) == 1
+    assert "acknowledges nothing" in shared.failures[0][0]
+    assert not shared.failures[1]
+
+
+def test_a_vehicle_that_never_answers_is_known_before_its_pilot_gives_up():
+    shared = Shared(RadioVehicle(), RadioVehicle())
+    shared.radios[0].off = True
+    shared.run(FIRST_ANSWER_TIMEOUT - 0.5)
+    assert "is it on" in shared.failures[0][0]
+    assert not shared.failures[1]
 
 
 def test_an_answer_that_comes_late_is_not_taken_for_that_of_another_vehicle():
