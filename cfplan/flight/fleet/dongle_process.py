@@ -13,6 +13,7 @@ import select
 import signal
 import socket
 import struct
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
@@ -69,6 +70,7 @@ class SharedLink(CRTPDriver):
         self._end = end
         self._report: Callable[[str], None] | None = None
         self._heard = 0.0
+        self._reading, self._closed = threading.RLock(), False
 
     def connect(
         self, uri: str, radio_link_statistics_callback: object, link_error_callback: Callable[[str], None] | None
@@ -92,7 +94,8 @@ class SharedLink(CRTPDriver):
 
     def receive_packet(self, wait: float = 0.0) -> CRTPPacket | None:
         """Return the next packet, or None after `wait` s; report why the link is lost, once."""
-        kind, content = self._receive(wait)
+        with self._reading:
+            kind, content = self._receive(wait) if not self._closed else (None, b"")
         if kind is not None:
             self._heard = time.monotonic()
         elif time.monotonic() - self._heard > DONGLE_SILENT:
@@ -113,9 +116,11 @@ class SharedLink(CRTPDriver):
         return _Kind(kind), bytes(content)
 
     def close(self) -> None:
-        """Close the link; may be called twice."""
-        self._report = None
+        """Close the link, and return once nobody reads for it, as another may be opened; may be called twice."""
+        self._report, self._closed = None, True
         _tell(self._end, _Kind.CLOSE)
+        with self._reading:
+            pass
 
     def get_name(self) -> str:
         return "shared dongle"

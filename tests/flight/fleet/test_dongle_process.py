@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from functools import partial
 
 import pytest
@@ -13,6 +14,7 @@ from cfplan.errors import InputError, LinkError
 from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
 from cfplan.flight.fleet.inline_radio import dongle_mode, require_capacity
 from cfplan.flight.radio.radio_lock import lock_radio
+from cfplan.flight.radio.transport import start_receiver
 
 pytestmark = pytest.mark.integration
 
@@ -125,6 +127,19 @@ def test_a_link_that_is_opened_again_hears_nothing_of_the_one_before(dongles):
     again = Pilot(dongles, "left", "?safelink=0&autoping=0&ackfilter=0")
     again.link.send_packet(CRTPPacket(0xFF, bytearray(b"\xfe\x02")))
     assert again.link.receive_packet(1.0).header == 0xFF
+
+
+def test_a_link_that_is_opened_again_at_once_is_not_robbed_by_a_reader_of_the_one_before(dongles):
+    first = Pilot(dongles, "left").link
+    for _ in range(10):
+        ended = threading.Event()
+        start_receiver(first.receive_packet, lambda _: None, ended)
+        a_moment(0.02)
+        ended.set()
+        first.close()
+        (make,) = dongles.drivers("left")
+        first = make()
+        first.connect(shared_uri(URIS["left"]), None, None)
 
 
 def test_a_radio_that_cannot_be_opened_is_an_error_of_each_pilot():
