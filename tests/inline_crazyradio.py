@@ -101,6 +101,7 @@ class InlineCrazyradio:
         self.log: list[tuple[int, bytes]] = []  # last byte of the address, and frame
         self.late = False  # the next answer comes after the time-out
         self.broken = False
+        self.air_time = AIR_TIME
         self._answers: deque[bytes] = deque()
 
     def ctrl_transfer(self, kind, request, *, wValue, wIndex, timeout, data_or_wLength):
@@ -118,7 +119,7 @@ class InlineCrazyradio:
         self.log.append((data[7], bytes(data[8:])))
         vehicle = self.vehicles.get(data[7])
         content = vehicle.exchange(bytes(data[8:])) if vehicle is not None else None
-        self._pass_time(AIR_TIME if content is not None else UNACKNOWLEDGED_TIME)
+        self._pass_time(self.air_time if content is not None else UNACKNOWLEDGED_TIME)
         acknowledged = content is not None
         self._answers.append(bytes((2 + len(content or b""), int(acknowledged))) + (content or b""))
 

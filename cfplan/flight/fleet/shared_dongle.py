@@ -1,8 +1,8 @@
 """One Crazyradio for several vehicles: which packet it transmits next, and to which vehicle.
 
-Vehicles with a packet take turns; the one that was served longest ago is next. If none has a packet, vehicles are
-polled, as their packets come with acknowledgements. A vehicle that does not acknowledge is tried more seldom, so that
-it does not take the time of the others.
+Vehicles take turns; the one that was served longest ago is next. A vehicle without a packet is polled, as its own
+packets come with acknowledgements. One that does not acknowledge is tried more seldom, so that it does not take the
+time of the others.
 
 Safelink and packets that perish are as in radio/dongle.py. Of each vehicle one setpoint and one pose wait: the newest.
 """
@@ -16,7 +16,7 @@ from cfplan.flight.firmware import Timeouts
 from cfplan.flight.fleet.inline_radio import RadioAddress
 from cfplan.flight.radio.crtp import NULL_PACKET, Port
 from cfplan.flight.radio.dongle import DEAD_AFTER
-from cfplan.flight.radio.perishable import MAX_AGE, Outbox, is_perishable
+from cfplan.flight.radio.perishable import Outbox, is_perishable
 
 PACE = 0.002  # s, least time between packets to one vehicle, whose radio queue holds 5
 NEVER_HEARD_AFTER = 3.0  # s without an acknowledgement since the link was opened
@@ -61,24 +61,22 @@ class SharedVehicle:
         self._next = self._poll = now  # s, when it may be served, and when it is polled
 
     def put(self, packet: bytes, sent: float) -> None:
-        """Add a packet that its pilot sent at a time, s; it replaces an older one of its kind, in its place in line."""
+        """Add a packet that its pilot sent at a time, s; it replaces an older one of its kind.
+
+        A pose takes the place of the older one, so that setpoints do not always go first; all else stays in order.
+        """
         newest = is_perishable(packet) or packet[0] & ~_COUNTERS == _PING
-        self._waiting.pop(kind := packet[:1] if newest else packet, None)
+        kind = packet[:1] if newest else packet
+        if packet[0] >> 4 != Port.LOCALIZATION:
+            self._waiting.pop(kind, None)
         self._waiting[kind] = sent, packet
         if len(self._waiting) > _MOST_WAITING:
             del self._waiting[next(iter(self._waiting))]
 
-    def turn(self, now: float) -> float:
-        """Return when, s, its next turn is: a time that has passed if it is now."""
-        for kind, (sent, packet) in list(self._waiting.items()):
-            if now - sent > MAX_AGE and is_perishable(packet):
-                del self._waiting[kind]
-        return self._next if self.has_packet else max(self._next, self._poll)
-
     @property
-    def has_packet(self) -> bool:
-        """Return whether a packet waits, or is repeated until it is acknowledged."""
-        return bool(self._waiting) or not self._outbox.empty
+    def turn(self) -> float:
+        """Return when, s, its next turn is: a time that has passed if it is due."""
+        return self._next if self._waiting or not self._outbox.empty else max(self._next, self._poll)
 
     def frame(self, now: float) -> bytes:
         """Return what to transmit."""
@@ -132,10 +130,10 @@ class SharedDongle:
         Raises LinkError if the radio has not reported for RADIO_DEAD_AFTER.
         """
         now = self._clock.now()
-        vehicles = [(each, each.turn(now)) for each in self._vehicles if each.open]
+        vehicles = [(each, each.turn) for each in self._vehicles if each.open]
         due = [each for each, turn in vehicles if turn <= now]
         if due:
-            self._exchange(min(due, key=lambda each: (not each.has_packet, each.served)), now)
+            self._exchange(min(due, key=lambda each: each.served), now)
             return 0.0
         return min((turn for _, turn in vehicles), default=now + _POLL_PERIOD) - now
 
