@@ -33,10 +33,9 @@ from cfplan.recording.header import header_under
 from cfplan.recording.writer import RecordWriter
 from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.lab.stepped_fleet import FleetFlight, SteppedFleet
+from cfplan.simulation.lab.stepped_fleet import ARMED, FleetFlight, SteppedFleet
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.supervisor import State
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from studies.faults import on_floor, to_wall
 from studies.random_faults import PATIENT
@@ -53,7 +52,6 @@ _BESIDE = 0.03  # m, largest offset of a vehicle from the column of its start
 _IN_AIR = 0.05  # m above the floor
 _LONGEST_STALL = 5.0  # s
 _WORST = 10
-_ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
 
 
 class Kind(StrEnum):
@@ -286,7 +284,7 @@ def fly_with_fault(seed: int, fleets: Mapping[str, FleetMissions]) -> FaultyFlee
         contact=str(flown.contacts[0]) if flown.contacts else "",
         to_wall=min(to_wall(truth, space) for truth in truths),
         landed=all(map(on_floor, truths)),
-        disarmed=all(truth.supervisor[-1] not in _ARMED for truth in truths),
+        disarmed=all(truth.supervisor[-1] not in ARMED for truth in truths),
         readable=readable,
         brakes=flown.brakes,
         ends=", ".join(f"{each} {int(code)}" for each, code in flown.exit_codes.items()),
@@ -317,6 +315,10 @@ def _recorded(lab: SteppedFleet, fault: FleetFault, fleet: FleetMissions, folder
     with ExitStack() as files:
         writers = {name: files.enter_context(_writer(lab, fleet, name, folders[name])) for name in folders}
 
+        def strike_in_flight() -> None:
+            if fault.vehicle not in closed:
+                strike(fault, lab)
+
         def react(name: str, message: Telemetry) -> None:
             nonlocal struck
             writers[name].write(message)
@@ -326,7 +328,7 @@ def _recorded(lab: SteppedFleet, fault: FleetFault, fleet: FleetMissions, folder
                 closed.add(name)
             if name == fault.vehicle and message.phase is fault.phase and not struck:
                 struck = True
-                clock.at(message.time + fault.moment, lambda: fault.vehicle in closed or strike(fault, lab))
+                clock.at(message.time + fault.moment, strike_in_flight)
 
         return lab.fly(react)
 

@@ -209,11 +209,11 @@ def _warn_of_walls(members: Sequence[FleetMember], limits: Limits, on_step: OnSt
         places = trajectory.at(np.arange(0.0, trajectory.duration + _SAMPLE, _SAMPLE)).position
         away = limits.space.margin - limits.space.beyond(places)
         away[:, [FLOOR, _CEILING]] = np.inf
-        row, face = np.unravel_index(away.argmin(), away.shape)
+        row, face = divmod(int(away.argmin()), away.shape[1])
         nearest.append((float(away[row, face]), member.name, limits.space.faces[face]))
-    distance, name, face = min(nearest)
+    distance, name, wall = min(nearest)
     drift = drift_without_poses(limits)
-    text = f"{name} comes within {distance:.2f} m of {face}"
+    text = f"{name} comes within {distance:.2f} m of {wall}"
     with step(on_step, "walls") as results:
         if distance >= drift:
             results.append(text)
