@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.flight.firmware import estimate_errors
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.stops import stop_clock
 from cfplan.planning.fleet.coordination import Blocked, coordinate
@@ -25,11 +26,15 @@ from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, fin
 from cfplan.preparation.slow_motion import require_harmless_slow_motion
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import inside
+from cfplan.safety.space import FLOOR, inside
 from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
+from cfplan.vehicle.airframe import GRAVITY
 
 _TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
+_BLIND = 2.0  # s until a vehicle without poses has braked and come down
+_CEILING = FLOOR + 3  # its number among the faces
+_SAMPLE = 0.01  # s, from one place to the next that is compared with walls
 _LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"
 
 
@@ -186,7 +191,34 @@ def coordinate_fleet(
                 where=fleet.name,
                 hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each its own dongle, {_LOST_HINT}",
             )
+    _warn_of_walls(members, limits, on_step)
     return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
+
+
+def drift_without_poses(limits: Limits) -> float:
+    """Return how far, m, a vehicle that comes down without poses may drift aside, by the errors of its estimate."""
+    attitude_error, velocity_error = estimate_errors(limits)
+    return velocity_error * _BLIND + 0.5 * GRAVITY * math.tan(attitude_error) * _BLIND**2
+
+
+def _warn_of_walls(members: Sequence[FleetMember], limits: Limits, on_step: OnStep) -> None:
+    """Compare the paths with walls and obstacles: without poses a vehicle of a fleet does not move away from them."""
+    nearest = []
+    for member in members:
+        trajectory = member.plan.trajectory
+        places = trajectory.at(np.arange(0.0, trajectory.duration + _SAMPLE, _SAMPLE)).position
+        away = limits.space.margin - limits.space.beyond(places)
+        away[:, [FLOOR, _CEILING]] = np.inf
+        row, face = divmod(int(away.argmin()), away.shape[1])
+        nearest.append((float(away[row, face]), member.name, limits.space.faces[face]))
+    distance, name, wall = min(nearest)
+    drift = drift_without_poses(limits)
+    text = f"{name} comes within {distance:.2f} m of {wall}"
+    with step(on_step, "walls") as results:
+        if distance >= drift:
+            results.append(text)
+        else:
+            results.warn(f"{text}, and may drift {drift:.2f} m without poses, as none of a fleet moves off walls")
 
 
 def lost_clearance(apart: float) -> float:

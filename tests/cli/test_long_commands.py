@@ -36,6 +36,7 @@ SMALL_STUDIES = {
     "dry-runs": LINE,
     "exports": LINE,
     "faults": f"{LINE} --only radio",
+    "fleet-faults": "flights/fleets/two.yaml --flights 2",
     "fleets": "--fleets 1 --size 2 --moments 2",
     "flights": f"{LINE} --repeats 1",
     "giving-way": f"{LINE} --random 1",

@@ -7,12 +7,14 @@ import pytest
 
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.min_snap import min_snap
+from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import CLEAR, separations
 from cfplan.planning.plan import plan
-from cfplan.preparation.plan_fleet import PlannedFleet, prepare_fleet, rehearse_fleet
+from cfplan.preparation.plan_fleet import PlannedFleet, coordinate_fleet, prepare_fleet, rehearse_fleet
 from cfplan.preparation.plan_flight import PlannedFlight
 from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.preparation.steps import StepState
 from cfplan.simulation.dry_run import dry_run
 
 SKEW = 0.03
@@ -52,3 +54,27 @@ def test_a_fleet_whose_vehicles_deviate_more_than_allowed_is_refused_with_the_di
     needed = float(re.search(r"apart: ([\d.]+)", refused.value.hint)[1])
     assert needed - 0.01 < CLEAR + 2.0 * deviation <= needed
     assert rehearsed(replace(narrow, apart=needed))
+
+
+@pytest.fixture(scope="module")
+def beside_a_wall(limits):
+    """Two vehicles along the wall y = 4, of which the nearer is 0.5 m from it; the walls x are farther."""
+    flown = {y: plan(min_snap([[-0.6, y, 1.0], [0.6, y, 1.0]]), limits.airframe, limits) for y in (3.5, 2.5)}
+    return [FleetMember(f"at {y:g}", planned) for y, planned in flown.items()]
+
+
+@pytest.mark.parametrize(("velocity_error", "warned"), [(0.1, True), (0.05, False)])
+def test_a_path_nearer_to_a_wall_than_a_vehicle_without_poses_drifts_is_warned_of(
+    beside_a_wall, limits, velocity_error, warned
+):
+    """0.34 m in 2 s by 1° of attitude, and 0.2 m or 0.1 m by the error of the velocity."""
+    steps = {}
+    precise = replace(limits, link_loss=replace(limits.link_loss, velocity_error=velocity_error))
+    coordinate_fleet(
+        FleetFile("beside a wall", (), 0.35, SKEW), beside_a_wall, precise,
+        lambda name, state, result: steps.update({name: (state, result)}),
+    )  # fmt: skip
+    state, result = steps["walls"]
+    assert state is (StepState.WARNED if warned else StepState.FINISHED)
+    assert "at 3.5 comes within 0.50 m of the wall y = 4 m" in result
+    assert ("0.54 m" in result) == warned

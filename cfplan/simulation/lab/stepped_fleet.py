@@ -18,6 +18,7 @@ from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
+from cfplan.flight.radio.link import Link
 from cfplan.flight.telemetry import Quaternion, Telemetry, Triple
 from cfplan.simulation.lab.downwash import Contact, contacts, share_air
 from cfplan.simulation.lab.lab import Truth
@@ -30,9 +31,11 @@ from cfplan.simulation.virtual_vicon.cameras import Cameras, ViconSettings
 from cfplan.simulation.virtual_vicon.faults import Seen
 
 PERIOD = 0.01  # s between looks of the room and of the conductor
-_SETTLING = 0.1  # s until a supervisor reports that its vehicle was disarmed
+_SETTLING = 0.1  # s until a supervisor has disarmed its vehicle, and the truth shows it
 _AFTERWARDS = 6.0  # s that vehicles get to come to rest after the last pilot has ended
+_LEFT_ALONE = 36.0  # s that those get which do not arm themselves: on the floor one disarms 30 s after arming
 _FLYING = (State.FLYING, State.WARNING_LEVEL_OUT)
+ARMED = (State.ARMING, State.READY_TO_FLY, *_FLYING, State.LANDED)
 Message = PilotMessage | FlightEnded | Telemetry
 
 
@@ -124,8 +127,25 @@ class VehicleLab(SteppedLab):
         self.body: SteppedLab = self  # the vehicle that its cameras take for this one
         self.cameras = _BodyCameras(ViconSettings(seed=7 + seed), self._body_seen)
         self.orders = HeldOrders()
+        self.link: Link | None = None  # of its pilot, once it has connected
         self.deaf = False  # the conductor's messages do not reach its pilot
         self.died = False
+
+    @property
+    def must_disarm(self) -> bool:
+        """Return whether the vehicle, which does not arm itself, ends disarmed."""
+        return self.vehicle.settings.auto_arming is False
+
+    def pull_dongle(self) -> None:
+        """Let the dongle be gone from now on, which its driver reports at once."""
+        self.disturb(RadioFault(RadioFaultKind.DEAD))
+        if self.link is not None:
+            self.link._session.fail("the Crazyradio failed")  # as the dongle's driver does
+
+    def connect(self, hear: Callable[[Telemetry], None]) -> Link:
+        """Connect the pilot, and keep its link."""
+        self.link = connect(self, hear)
+        return self.link
 
     def kill_pilot(self) -> None:
         """Let the pilot's process die now: nothing of it reaches the vehicle any more. Call it in the pilot's turn."""
@@ -211,10 +231,11 @@ class SteppedFleet:
                 self._heard.append((name, end))
             while len(self._notes.ends) < len(self.labs):
                 lab.clock.sleep(PERIOD)
-            lab.clock.sleep(_SETTLING)
-            until = lab.now + _AFTERWARDS
-            while lab.vehicle.supervisor_state in _FLYING and lab.now < until:
+            moves, patience = (ARMED, _LEFT_ALONE) if lab.must_disarm else (_FLYING, _AFTERWARDS)
+            until = lab.now + patience
+            while lab.vehicle.supervisor_state in moves and lab.now < until:
                 lab.clock.sleep(PERIOD)
+            lab.clock.sleep(_SETTLING)
 
         return act
 
@@ -233,7 +254,7 @@ class SteppedFleet:
         )
         pilot = Pilot(
             mission,
-            connect=lambda _: connect(lab, hear),
+            connect=lambda _: lab.connect(hear),
             source=SteppedPoses(lab, mission.limits.pose),
             report=hear,
             orders=lab.orders,
