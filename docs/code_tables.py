@@ -114,9 +114,9 @@ TIME_OUTS: Mapping[str, Sequence[TimeOut]] = {
                 "it hovers where it is, then lands there; no old setpoint is sent", "the pilot"),
         TimeOut("acknowledgements, for good", LINK_LOST_AFTER,
                 "the link counts as lost: exit code 8, the record is closed", "the pilot"),
-        TimeOut("the process of a dongle that vehicles of a fleet share", DONGLE_SILENT,
-                "its links count as lost; they are lost at once if the process dies", "each pilot"),
-        TimeOut("reports of that dongle by USB", RADIO_DEAD_AFTER, "its links count as lost", "the dongle's process"),
+        TimeOut("messages from the process of a shared dongle", DONGLE_SILENT,
+                "its links count as lost; at once if the process dies", "each pilot"),
+        TimeOut("USB reports of a shared dongle", RADIO_DEAD_AFTER, "its links count as lost", "the dongle's process"),
     ),
     "poses": (
         TimeOut("a pose, before take-off", POSE.age_warning, "preflight refuses", "the pilot", "pose.age_warning"),

@@ -1,7 +1,7 @@
-"""Fly each FLEET in turn with one fault per flight, by seed: none may touch another, each must land and disarm.
+"""Fly each FLEET in turn with one random fault per flight: no vehicles may touch, and each must land and disarm.
 
-The seed of a flight determines its fleet, the fault with its length and size, the vehicle that it strikes, the phase
-and the moment, and where the vehicles stand. The pilots and the conductor fly in one stepped lab; distances are those
+The seed of a flight determines its fleet, the fault with its duration and size, the vehicle that it strikes, the phase
+and the moment, and where the vehicles stand. The pilots and the conductor run in one stepped lab; distances are those
 of the true positions. To repeat a flight of the tables, give its seed and the same fleets.
 
 Some faults are not covered by the certificate of a fleet (docs/fleets.md); their flights are counted apart.
@@ -45,17 +45,17 @@ from studies.runner.reductions import count, smallest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
-_LENGTH, _SPREAD = 0.5, 1.0  # median, s, and standard deviation of the logarithm of a fault's duration
-_FRACTION_FOR_GOOD = 0.5  # of the faults that may end
-_SHORTEST = 0.05  # s, of a short loss of a link
-_BESIDE = 0.03  # m, largest offset of a vehicle from the column of its start
-_IN_AIR = 0.05  # m above the floor
-_LONGEST_STALL = 5.0  # s
-_WORST = 10
+_MEDIAN_DURATION, _LOG_DURATION_STD = 0.5, 1.0  # of a fault: s, and standard deviation of the logarithm
+_PERMANENT_FRACTION = 0.5  # of the faults that may end
+_MIN_LINK_LOSS = 0.05  # s
+_MAX_START_OFFSET = 0.03  # m, horizontally, of a vehicle from its start
+_AIRBORNE_HEIGHT = 0.05  # m above the floor
+_MAX_STALL = 5.0  # s
+_NEAREST = 10  # flights in the table of those in which vehicles came nearest
 
 
 class Kind(StrEnum):
-    """Kinds of faults."""
+    """Faults of fleets; the value is the name in tables."""
 
     LINK = "link lost"  # for BACK or longer
     SHORT_LINK = "link lost briefly"  # for less
@@ -83,7 +83,7 @@ _LEFT_OUT = {
     Kind.SHORT_LINK: "left out: short loss of a link",
     Kind.POSES: _WITHOUT_POSES,
     Kind.ALL_POSES: _WITHOUT_POSES,
-    Kind.LATE: _WITHOUT_POSES,  # older ones are not used
+    Kind.LATE: _WITHOUT_POSES,  # the pilot does not use late poses
     Kind.ALL_LATE: _WITHOUT_POSES,
     Kind.ORDER: "left out: an order that one vehicle does not hear",
 }
@@ -94,7 +94,7 @@ _PHASES: tuple[tuple[Phase, float], ...] = (
     (Phase.PREFLIGHT, 1.0),
     (Phase.ARM, 0.3),
     (Phase.TAKE_OFF, 2.0),
-    (Phase.GO_TO_START, 5.0),  # with the time in which it waits for the others
+    (Phase.GO_TO_START, 5.0),  # includes waiting for the other vehicles
     *((Phase.STREAM, math.inf),) * 8,
     (Phase.HOLD, 1.0),
     *((Phase.LAND, 2.5),) * 2,
@@ -126,11 +126,11 @@ class FleetFault:
 
     kind: Kind
     vehicle: str  # that it strikes
-    other: str  # the second one, of faults that need two
-    phase: Phase  # of the vehicle
+    other: str  # the second vehicle, if the fault needs two
+    phase: Phase  # of `vehicle`
     moment: float  # s after the phase began
     duration: float  # s
-    size: float  # V or s, of faults that have one
+    size: float  # V of a low battery, s of late poses
 
     def __str__(self) -> str:
         size = {Kind.BATTERY: f" {self.size:.2f} V", Kind.LATE: f" {self.size:.2f} s"}
@@ -151,24 +151,24 @@ class FaultyFleetFlight:
     coverage: str  # whether the certificate covers the fault, and if not, why
     fault: str
     phase: str
-    nearest: float  # m, least horizontal distance of two vehicles in the air; infinite where never two were
+    nearest: float  # m, least horizontal distance of two vehicles in the air; infinite if there never were two
     contacts: int  # pairs that touched
-    contact: str  # the first one
+    contact: str  # the first contact; empty if there was none
     to_wall: float  # m, least distance of any vehicle from walls and ceiling; negative beyond them
     landed: bool  # all on the floor, motors off
-    disarmed: bool  # all
-    readable: bool  # all records can be read
-    brakes: str  # why the conductor let all brake; empty where it did not
+    disarmed: bool  # all vehicles
+    readable: bool  # every record can be read
+    brakes: str  # why the conductor let all brake; empty if it did not
     ends: str  # exit code of each vehicle
 
     @property
     def bad(self) -> bool:
-        """Return whether two touched, one left the walls, or one did not land or disarm or has no readable record."""
+        """Return whether vehicles touched, or one left the walls, did not land or disarm, or has no readable record."""
         return not (not self.contacts and self.to_wall > 0.0 and self.landed and self.disarmed and self.readable)
 
     @property
     def size(self) -> str:
-        """Return the number of vehicles, and the fleet."""
+        """Return the number of vehicles and the name of the fleet, for tables."""
         return f"{self.vehicles}: {self.fleet}"
 
 
@@ -230,16 +230,17 @@ def random_fault(seed: int, missions: Mapping[str, Mission]) -> FleetFault:
     if kind is Kind.UNARMED:
         phase, latest = Phase.ARM, 0.1
     moment = float(chance.uniform(0.0, min(latest, missions[vehicle].duration)))
-    for_good, length = chance.random() < _FRACTION_FOR_GOOD, float(_LENGTH * np.exp(_SPREAD * chance.normal()))
+    permanent = chance.random() < _PERMANENT_FRACTION
+    length = float(_MEDIAN_DURATION * np.exp(_LOG_DURATION_STD * chance.normal()))
     size = float(chance.uniform(0.0, 1.0))
-    duration = math.inf if for_good else length
+    duration = math.inf if permanent else length
     match kind:
         case Kind.LINK:
             duration = max(duration, BACK)
         case Kind.SHORT_LINK:
-            duration = _SHORTEST + (BACK - _SHORTEST) * size
+            duration = _MIN_LINK_LOSS + (BACK - _MIN_LINK_LOSS) * size
         case Kind.STALL:
-            duration = min(length, _LONGEST_STALL)
+            duration = min(length, _MAX_STALL)
         case Kind.BATTERY:
             duration, size = math.inf, 3.0 + 0.4 * size
         case Kind.LATE | Kind.ALL_LATE:
@@ -292,11 +293,11 @@ def fly_with_fault(seed: int, fleets: Mapping[str, FleetMissions]) -> FaultyFlee
 
 
 def _standing(missions: Mapping[str, Mission], seed: int) -> dict[str, VehicleSettings]:
-    """Return where the vehicles stand; they do not arm themselves, so their last state shows if they were disarmed."""
+    """Return each vehicle's place; none arms itself, so the last state shows whether it was disarmed."""
     chance, settings = np.random.default_rng((seed, 1)), {}
     for name, mission in missions.items():
         (x, y, _), yaw = mission.start
-        radius, angle = _BESIDE * chance.random(), chance.uniform(0.0, 2.0 * np.pi)
+        radius, angle = _MAX_START_OFFSET * chance.random(), chance.uniform(0.0, 2.0 * np.pi)
         place = float(x + radius * np.cos(angle)), float(y + radius * np.sin(angle)), 0.0
         settings[name] = VehicleSettings(
             position=place,
@@ -350,7 +351,7 @@ def _readable(folder: Path) -> bool:
 
 
 def strike(fault: FleetFault, fleet: SteppedFleet) -> None:
-    """Let the fault begin now; call it in the turn of the struck vehicle's pilot."""
+    """Begin the fault now; call this in the turn of the struck vehicle's pilot."""
     lab, labs, lasts = fleet.labs[fault.vehicle], fleet.labs.values(), fault.duration
     match fault.kind:
         case Kind.LINK | Kind.SHORT_LINK:
@@ -406,14 +407,14 @@ def nearest_in_air(truths: Sequence[Truth]) -> float:
     least = math.inf
     for one, two in combinations(truths, 2):
         other = np.column_stack([np.interp(one.time, two.time, along) for along in two.position.T])
-        flying = (one.position[:, 2] > _IN_AIR) & (other[:, 2] > _IN_AIR)
+        flying = (one.position[:, 2] > _AIRBORNE_HEIGHT) & (other[:, 2] > _AIRBORNE_HEIGHT)
         away = np.linalg.norm(other[flying, :2] - one.position[flying, :2], axis=1)
         least = min(least, float(away.min(initial=math.inf)))
     return least
 
 
 def tables(settings: Settings, rows: list[FaultyFleetFlight]) -> Iterator[Table]:
-    """Yield the flights by what the certificate covers, by fault, fleet and phase, the nearest and the failed ones."""
+    """Yield tables by coverage, fault, fleet and phase, and of the nearest and the failed flights."""
     bad, kinds, phases = [row for row in rows if row.bad], list(map(str, Kind)), list(map(str, Phase))
     title = f"{len(rows)} flights with one fault each, {len(bad)} went wrong"
 
@@ -426,7 +427,7 @@ def tables(settings: Settings, rows: list[FaultyFleetFlight]) -> Iterator[Table]
     yield grouped("kinds", "By fault", "kind", "fault", kinds.index)
     yield grouped("fleets", "By fleet", "size", "fleet", str)
     yield grouped("phases", "By the phase of the struck vehicle", "phase", "phase", phases.index)
-    yield table("worst", "Nearest to each other", FLIGHT_COLUMNS, sorted(rows, key=attrgetter("nearest"))[:_WORST])
+    yield table("worst", "Nearest to each other", FLIGHT_COLUMNS, sorted(rows, key=attrgetter("nearest"))[:_NEAREST])
     yield table("bad", f"{len(bad)} flights went wrong", FLIGHT_COLUMNS, bad)
 
 

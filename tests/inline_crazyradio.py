@@ -1,4 +1,4 @@
-"""A Crazyradio 2.0 in inline mode that is not there, at the level of USB, and vehicles behind it."""
+"""A simulated Crazyradio 2.0 in inline mode, at the level of USB, and the radios of the vehicles that it reaches."""
 
 import errno
 import socket
@@ -18,12 +18,12 @@ UNACKNOWLEDGED_TIME = 0.003  # s, with three repetitions
 
 
 def unmarked(packet) -> bytes:
-    """Return a packet with both bits of safelink's counters set, as it is without them."""
+    """Return a packet with both counter bits of safelink set, as they are without safelink."""
     return bytes((packet[0] | 0x0C, *packet[1:]))
 
 
 class RadioVehicle:
-    """A vehicle's radio: it takes each packet once, and its own wait until they are acknowledged."""
+    """A vehicle's radio: it receives each packet once, and repeats its own until they are acknowledged."""
 
     def __init__(self, loss: float = 0.0, *, safelink: bool = True):
         self.off, self.has_safelink = False, safelink
@@ -32,11 +32,11 @@ class RadioVehicle:
         self._began, self._up, self._down, self._held = False, 1, 1, False
         self._loss, self._chance = loss, np.random.default_rng(3)
 
-    def take(self, packet: bytes) -> None:
+    def receive(self, packet: bytes) -> None:
         self.received.append(packet)
 
-    def come(self) -> None:
-        """Add what it sends by now to `to_send`."""
+    def collect(self) -> None:
+        """Add the packets that the vehicle has sent meanwhile to `to_send`."""
 
     def exchange(self, frame: bytes) -> bytes | None:
         """Hear a frame; return the content of the acknowledgement, or None if either is lost."""
@@ -48,12 +48,12 @@ class RadioVehicle:
         if not self._began or frame[0] >> 3 & 1 != self._up:
             self._up = 1 - self._up
             if unmarked(frame) != NULL:
-                self.take(unmarked(frame))
+                self.receive(unmarked(frame))
         if self._began and frame[0] >> 2 & 1 != self._down:
             self._down = 1 - self._down
             if self._held:
                 self.to_send.popleft()
-        self.come()
+        self.collect()
         self._held = bool(self.to_send)
         answer = self.to_send[0] if self._held else NULL
         if not self._began and self._held:
@@ -63,15 +63,15 @@ class RadioVehicle:
 
 
 class EchoVehicle(RadioVehicle):
-    """A vehicle that sends back each packet."""
+    """A vehicle that returns each packet."""
 
-    def take(self, packet: bytes) -> None:
-        super().take(packet)
+    def receive(self, packet: bytes) -> None:
+        super().receive(packet)
         self.to_send.append(packet)
 
 
 class UdpVehicle(RadioVehicle):
-    """The radio of a virtual vehicle, which has a port on this computer."""
+    """The radio of a virtual vehicle, which listens on a UDP port of this computer."""
 
     def __init__(self, port: int):
         super().__init__()
@@ -79,10 +79,10 @@ class UdpVehicle(RadioVehicle):
         self._socket.connect(("127.0.0.1", port))
         self._socket.setblocking(False)
 
-    def take(self, packet: bytes) -> None:
+    def receive(self, packet: bytes) -> None:
         self._socket.send(packet)
 
-    def come(self) -> None:
+    def collect(self) -> None:
         while True:
             try:
                 packet = self._socket.recv(64)
@@ -93,7 +93,7 @@ class UdpVehicle(RadioVehicle):
 
 
 class InlineCrazyradio:
-    """Stands in for cflib's Crazyradio, and for its USB handle; `vehicles` by the last byte of their addresses."""
+    """A stand-in for cflib's Crazyradio and its USB handle; `vehicles` by the last byte of their addresses."""
 
     def __init__(self, vehicles: dict[int, RadioVehicle], pass_time=time.sleep):
         self.vehicles, self._pass_time = vehicles, pass_time
@@ -136,7 +136,7 @@ class InlineCrazyradio:
 
 
 def radio_of_echoing_vehicles(dongle: str) -> InlineRadio:
-    """Open a radio with two vehicles, 1 and 2, which send back each packet."""
+    """Open a radio with two vehicles, 1 and 2, which return each packet."""
     return InlineRadio(InlineCrazyradio({1: EchoVehicle(), 2: EchoVehicle()}))
 
 
@@ -145,5 +145,5 @@ def absent_radio(dongle: str) -> InlineRadio:
 
 
 def radio_of_virtual_vehicles(ports: dict[int, int], dongle: str) -> InlineRadio:
-    """Open a radio with virtual vehicles, by the last bytes of their addresses; their ports are given."""
+    """Open a radio with virtual vehicles; `ports` maps the last bytes of their addresses to their UDP ports."""
     return InlineRadio(InlineCrazyradio({number: UdpVehicle(port) for number, port in ports.items()}))

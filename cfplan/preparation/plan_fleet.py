@@ -32,9 +32,9 @@ from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 from cfplan.vehicle.airframe import GRAVITY
 
 _TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
-_BLIND = 2.0  # s until a vehicle without poses has braked and come down
+_BLIND = 2.0  # s in which a vehicle without poses brakes and comes down
 _CEILING = FLOOR + 3  # its number among the faces
-_SAMPLE = 0.01  # s, from one place to the next that is compared with walls
+_SAMPLE = 0.01  # s between the positions of a path that are compared with walls
 _LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"
 
 
@@ -189,20 +189,20 @@ def coordinate_fleet(
             raise InfeasibleError(
                 f"no start delays and clock rates keep {model.clearance:.2f} m from a lost vehicle: {losses[0]}",
                 where=fleet.name,
-                hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each its own dongle, {_LOST_HINT}",
+                hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each vehicle its own dongle, {_LOST_HINT}",
             )
     _warn_of_walls(members, limits, on_step)
     return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
 
 
 def drift_without_poses(limits: Limits) -> float:
-    """Return how far, m, a vehicle that comes down without poses may drift aside, by the errors of its estimate."""
+    """Return how far, m, a vehicle that lands without poses may drift sideways, by the errors of its estimate."""
     attitude_error, velocity_error = estimate_errors(limits)
     return velocity_error * _BLIND + 0.5 * GRAVITY * math.tan(attitude_error) * _BLIND**2
 
 
 def _warn_of_walls(members: Sequence[FleetMember], limits: Limits, on_step: OnStep) -> None:
-    """Compare the paths with walls and obstacles: without poses a vehicle of a fleet does not move away from them."""
+    """Warn of a path near walls or obstacles, as without poses a vehicle of a fleet does not move away from them."""
     nearest = []
     for member in members:
         trajectory = member.plan.trajectory
@@ -218,7 +218,7 @@ def _warn_of_walls(members: Sequence[FleetMember], limits: Limits, on_step: OnSt
         if distance >= drift:
             results.append(text)
         else:
-            results.warn(f"{text}, and may drift {drift:.2f} m without poses, as none of a fleet moves off walls")
+            results.warn(f"{text}, and may drift {drift:.2f} m without poses: in a fleet it does not move off walls")
 
 
 def lost_clearance(apart: float) -> float:

@@ -138,7 +138,7 @@ class ConnectedFleet:
         self._conductor = Conductor(flights, self.plan.apart, holds=True)
 
     def _start_pilots(self, addresses: dict[str, VehicleAddress]) -> dict[str, PilotProcess]:
-        """Start the pilots, after the processes of the dongles that they share, which end after them."""
+        """Start the processes of shared dongles and then the pilots, so that the dongles' processes end last."""
         shared = {name: address.uri for name, address in addresses.items() if address.dongle}
         with main_module_hidden():
             dongles = self._open.enter_context(SharedDongles(shared))

@@ -23,7 +23,7 @@ class VehicleAddress:
     uri: str
     body: str
     mocap: str = ""  # URI of the body; empty in a virtual room, which has a virtual Vicon
-    dongle: str = ""  # the number of the dongle that it shares with others; empty if it shares none
+    dongle: str = ""  # number of the dongle, if other vehicles share it; else empty
 
     @property
     def pilot_uri(self) -> str:
@@ -66,7 +66,7 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAdd
 
 
 def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, on_step: OnStep) -> None:
-    """Check that each dongle is available and carries its vehicles, and that each body is seen, before planning.
+    """Check, before planning, that each dongle is free and has the capacity for its vehicles, and each body is seen.
 
     Raises a CfplanError.
     """

@@ -46,7 +46,7 @@ LIMITS = replace(  # the computer that runs tests stands still now and then
 )
 NAMES = ("left", "right")
 ADDRESSES = {name: f"radio://0/80/2M/E7E7E7E70{number}" for number, name in enumerate(NAMES)}
-DOWN = 0.05  # m
+DOWN = 0.05  # m, below which a vehicle is on the floor
 
 
 def mission(y: float) -> Mission:
@@ -59,8 +59,8 @@ def mission(y: float) -> Mission:
 def fly_two(react=lambda name, message, pids: None, *, dongle: bool = False):
     """Fly two vehicles side by side; return the outcome and the truth of each, once both are down.
 
-    With `dongle` they share a Crazyradio, which is simulated at the level of USB. `react` hears of everything, and gets
-    the numbers of processes: of pilots by their vehicles' names, and of the "dongle".
+    With `dongle` they share a Crazyradio, which is simulated at the level of USB. `react` gets each message of a pilot
+    and the process numbers of the pilots, by their vehicles' names, and of the "dongle".
     """
     missions = {name: mission(0.6 * number) for number, name in enumerate(NAMES)}
     places = [
@@ -113,7 +113,7 @@ def test_two_vehicles_start_together_and_land():
 
 
 def kill_when_flying(which: str, number: signal.Signals = signal.SIGKILL):
-    """Return a reaction that kills a process once the vehicle `left` begins its path."""
+    """Return a listener that sends a signal to a process once the vehicle `left` begins its path."""
     killed = False
 
     def kill(name, message, pids):
@@ -181,7 +181,7 @@ def narrow_room(folder: Path, *uris: str) -> Path:
 
 
 def put_in_place_of_a_crazyradio(monkeypatch, ports):
-    """Simulate a Crazyradio 2.0 with vehicles behind it at these ports, by the last bytes of their addresses."""
+    """Simulate a Crazyradio 2.0; `ports` maps the last bytes of its vehicles' addresses to their UDP ports."""
     open_radio = partial(radio_of_virtual_vehicles, ports)
     monkeypatch.setattr("cfplan.steering.connected_fleet.SharedDongles", partial(SharedDongles, open_radio=open_radio))
     monkeypatch.setattr("cfplan.steering.fleet_addresses.find_radios", lambda: [SimpleNamespace(bcdDevice=0x0501)])

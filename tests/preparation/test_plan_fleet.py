@@ -58,7 +58,7 @@ def test_a_fleet_whose_vehicles_deviate_more_than_allowed_is_refused_with_the_di
 
 @pytest.fixture(scope="module")
 def beside_a_wall(limits):
-    """Two vehicles along the wall y = 4, of which the nearer is 0.5 m from it; the walls x are farther."""
+    """Two vehicles along the wall y = 4 m; the nearer is 0.5 m from it, and the other walls are farther."""
     flown = {y: plan(min_snap([[-0.6, y, 1.0], [0.6, y, 1.0]]), limits.airframe, limits) for y in (3.5, 2.5)}
     return [FleetMember(f"at {y:g}", planned) for y, planned in flown.items()]
 
@@ -67,7 +67,7 @@ def beside_a_wall(limits):
 def test_a_path_nearer_to_a_wall_than_a_vehicle_without_poses_drifts_is_warned_of(
     beside_a_wall, limits, velocity_error, warned
 ):
-    """0.34 m in 2 s by 1° of attitude, and 0.2 m or 0.1 m by the error of the velocity."""
+    """In 2 s it drifts 0.34 m by 1° of attitude error, and 0.2 m or 0.1 m by the error of its velocity."""
     steps = {}
     precise = replace(limits, link_loss=replace(limits.link_loss, velocity_error=velocity_error))
     coordinate_fleet(

@@ -1,4 +1,4 @@
-"""The study of fleets with faults: what its tables count, and flights that it records and judges."""
+"""The study of fleets with faults: the counts of its tables, and flights that it records and judges."""
 
 import itertools
 from dataclasses import replace
@@ -84,12 +84,12 @@ def truth(x, z):
 def test_only_vehicles_in_the_air_count_as_near():
     passes, stands = np.linspace(-1.0, 1.0, 201), np.zeros(201)
     assert nearest_in_air((truth(passes, stands + 1.0), truth(stands, stands))) == np.inf
-    hovers = np.where(passes > 0.305, 0.5, 0.0)  # it takes off once the other has passed
+    hovers = np.where(passes > 0.305, 0.5, 0.0)  # takes off after the other has passed
     assert nearest_in_air((truth(passes, stands + 1.0), truth(stands, hovers))) == pytest.approx(0.31)
 
 
 def mission(y):
-    """0.8 m along x at this y, in 2 s."""
+    """Return a mission of 0.8 m along x at this y, in 2 s."""
     setpoints = decode(septic_payloads(0.8, 2.0, 0.6))
     moved = encode(replace(setpoints, position=setpoints.position + np.array((0.0, y, 0.0))))
     payloads = np.concatenate([moved, np.repeat(moved[-1:], 30, axis=0)])

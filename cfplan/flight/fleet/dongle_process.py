@@ -1,8 +1,8 @@
 """The process that owns a shared Crazyradio, and the link of each pilot to it.
 
-Each pilot has a socket to it. If the process dies, all sockets close, and every pilot knows at once that its link is
-lost; if it hangs, pings stay without answer. If a pilot ends, its vehicle is no longer served. The process ends with
-the last pilot, also without a main process, which may die while vehicles still fly.
+A socket connects each pilot with the process. If the process dies, its sockets close, and every pilot knows at once
+that its link is lost; if it hangs, the pilots stop hearing from it. If a pilot ends, its vehicle is no longer served.
+The process ends with the last pilot. It does not need the main process, which may die while vehicles still fly.
 """
 
 import contextlib
@@ -32,44 +32,46 @@ from cfplan.flight.fleet.shared_dongle import SharedDongle, SharedRadio, SharedV
 from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.real_time import lock_memory, shorten_time_slice, use_fifo_scheduling
 
-SCHEME = "shared://"  # of a pilot's URI, in place of radio://
-DONGLE_SILENT = Timeouts().motors_off  # s without a message of the process: the link is lost, and no vehicle flies on
-_ALIVE_PERIOD = 0.2  # s between messages that say that the process is alive
-_OPENS_WITHIN = 3.0  # s, for a Crazyradio to be opened
-_ENDS_WITHIN = 2.0  # s, after the last pilot
-_LONGEST_WAIT = 0.1  # s
-_LONGEST_MESSAGE = 1024
-_SENT = struct.Struct("<d")  # s, when a pilot sent a packet
+SCHEME = "shared://"  # replaces radio:// in a pilot's URI
+DONGLE_SILENT = Timeouts().motors_off  # s without a message: the link is lost; by then no vehicle flies
+_ALIVE_PERIOD = 0.2  # s between ALIVE messages to each pilot
+_OPEN_TIMEOUT = 3.0  # s for the process to open the Crazyradio
+_END_TIMEOUT = 2.0  # s for the process to end after the last pilot; then it is killed
+_MAX_WAIT = 0.1  # s for a pilot's message, so that ALIVE messages are sent in time
+_MAX_MESSAGE = 1024  # bytes
+_SEND_TIME = struct.Struct("<d")  # s; precedes each packet from a pilot
 
 OpenRadio = Callable[[str], SharedRadio]
 
 
-class _Kind(IntEnum):
+class _MessageKind(IntEnum):
     """The first byte of a message."""
 
-    OPEN = 1  # pilot to dongle
-    OPEN_PLAIN = 2  # the same, without safelink
+    # From a pilot to the process, except that packets go both ways:
+    OPEN = 1
+    OPEN_PLAIN = 2  # without safelink
     CLOSE = 3
-    PACKET = 4  # both ways
-    OPENED = 5  # dongle to pilot
+    PACKET = 4
+    # From the process to a pilot:
+    OPENED = 5
     ALIVE = 6
-    LOST = 7  # with the reason
+    LOST = 7  # followed by the reason
 
 
-def _tell(end: socket.socket, kind: _Kind, content: bytes = b"") -> None:
-    """Send a message, or drop it where the other end does not read or has ended, which it notices by itself."""
+def _send(end: socket.socket, kind: _MessageKind, content: bytes = b"") -> None:
+    """Send a message; drop it if the other end does not read or has closed, which each end notices by itself."""
     with contextlib.suppress(OSError):
         end.send(bytes((kind,)) + content, socket.MSG_DONTWAIT)
 
 
 class SharedLink(CRTPDriver):
-    """A cflib link driver for shared://: the link of one pilot."""
+    """A cflib link driver for shared:// URIs: one pilot's link to its vehicle."""
 
     def __init__(self, end: socket.socket) -> None:
         super().__init__()
         self._end = end
-        self._report: Callable[[str], None] | None = None
-        self._heard = 0.0
+        self._on_lost: Callable[[str], None] | None = None
+        self._heard_at = 0.0
         self._reading, self._closed = threading.RLock(), False
 
     def connect(
@@ -78,47 +80,47 @@ class SharedLink(CRTPDriver):
         """Open the link. Raises WrongUriType for a URI of another driver, LinkError if the dongle cannot be used."""
         if not uri.startswith(SCHEME):
             raise WrongUriType(f"not a {SCHEME} URI")
-        _tell(self._end, _Kind.OPEN_PLAIN if "safelink=0" in uri else _Kind.OPEN)
-        until = time.monotonic() + _OPENS_WITHIN
+        _send(self._end, _MessageKind.OPEN_PLAIN if "safelink=0" in uri else _MessageKind.OPEN)
+        until = time.monotonic() + _OPEN_TIMEOUT
         kind = None
-        while kind is not _Kind.OPENED:  # what came for an earlier link is discarded
+        while kind is not _MessageKind.OPENED:  # messages for an earlier link are discarded
             kind, content = self._receive(max(until - time.monotonic(), 0.0))
             if kind is None:
                 content = b"the dongle's process does not answer"
-            if kind in (None, _Kind.LOST):
+            if kind in (None, _MessageKind.LOST):
                 raise LinkError(content.decode(), where=uri, hint="plug the Crazyradio in again")
-        self._report, self._heard = link_error_callback, time.monotonic()
+        self._on_lost, self._heard_at = link_error_callback, time.monotonic()
 
     def send_packet(self, pk: CRTPPacket) -> None:
-        _tell(self._end, _Kind.PACKET, _SENT.pack(time.monotonic()) + bytes((pk.header, *pk.data)))
+        _send(self._end, _MessageKind.PACKET, _SEND_TIME.pack(time.monotonic()) + bytes((pk.header, *pk.data)))
 
     def receive_packet(self, wait: float = 0.0) -> CRTPPacket | None:
-        """Return the next packet, or None after `wait` s; report why the link is lost, once."""
+        """Return the next packet, or None after `wait`, s. Reports once why the link is lost."""
         with self._reading:
             kind, content = self._receive(wait) if not self._closed else (None, b"")
         if kind is not None:
-            self._heard = time.monotonic()
-        elif time.monotonic() - self._heard > DONGLE_SILENT:
-            kind, content = _Kind.LOST, f"the dongle's process has been silent for {DONGLE_SILENT:g} s".encode()
-        if kind is _Kind.LOST and self._report is not None:
-            report, self._report = self._report, None
+            self._heard_at = time.monotonic()
+        elif time.monotonic() - self._heard_at > DONGLE_SILENT:
+            kind, content = _MessageKind.LOST, f"the dongle's process has been silent for {DONGLE_SILENT:g} s".encode()
+        if kind is _MessageKind.LOST and self._on_lost is not None:
+            report, self._on_lost = self._on_lost, None
             report(content.decode())
-        return CRTPPacket(content[0], bytearray(content[1:])) if kind is _Kind.PACKET else None
+        return CRTPPacket(content[0], bytearray(content[1:])) if kind is _MessageKind.PACKET else None
 
-    def _receive(self, wait: float) -> tuple[_Kind | None, bytes]:
+    def _receive(self, wait: float) -> tuple[_MessageKind | None, bytes]:
         """Return the next message, or None after `wait`, s."""
         if not select.select([self._end], [], [], wait)[0]:
             return None, b""
         try:
-            kind, *content = self._end.recv(_LONGEST_MESSAGE)
-        except (OSError, ValueError):  # nothing to unpack: its end has closed
-            return _Kind.LOST, b"the dongle's process has ended"
-        return _Kind(kind), bytes(content)
+            kind, *content = self._end.recv(_MAX_MESSAGE)
+        except (OSError, ValueError):  # an empty message, which cannot be unpacked: the other end has closed
+            return _MessageKind.LOST, b"the dongle's process has ended"
+        return _MessageKind(kind), bytes(content)
 
     def close(self) -> None:
-        """Close the link, and return once nobody reads for it, as another may be opened; may be called twice."""
-        self._report, self._closed = None, True
-        _tell(self._end, _Kind.CLOSE)
+        """Close the link, and wait for its reader, which would take packets of the next link; may be called twice."""
+        self._on_lost, self._closed = None, True
+        _send(self._end, _MessageKind.CLOSE)
         with self._reading:
             pass
 
@@ -127,11 +129,11 @@ class SharedLink(CRTPDriver):
 
 
 class SharedDongles:
-    """The processes of all dongles that vehicles of a fleet share; a context manager."""
+    """The processes of all dongles that the vehicles of a fleet share; a context manager."""
 
     def __init__(self, uris: Mapping[str, str], open_radio: OpenRadio = open_inline_radio):
-        """Start a process for each dongle; `uris` are the addresses, radio://…, of vehicles by their names."""
-        self._ends: dict[str, socket.socket] = {}  # of pilots, by the names of their vehicles
+        """Start a process for each dongle; `uris` maps the names of vehicles to their addresses, radio://…."""
+        self._ends: dict[str, socket.socket] = {}  # the pilots' sockets, by vehicle name
         by_dongle: dict[str, list[str]] = {}
         for name, uri in uris.items():
             by_dongle.setdefault(uri.removeprefix("radio://").partition("/")[0], []).append(name)
@@ -149,17 +151,17 @@ class SharedDongles:
             target=_run, args=(dongle, links, open_radio), name=f"dongle {dongle}"
         )
         process.start()
-        for name, (pilots, own) in pairs.items():
-            self._ends[name] = pilots
-            own.close()
+        for name, (pilot_end, dongle_end) in pairs.items():
+            self._ends[name] = pilot_end
+            dongle_end.close()  # the process has its own copy
         return process
 
     def drivers(self, name: str) -> list[type]:
-        """Return the cflib link drivers for the pilot of a vehicle, to be given to `start_pilot`."""
-        return [cast("type", partial(SharedLink, self._ends[name]))]  # cflib calls it to make a link
+        """Return the cflib link drivers of a vehicle's pilot, for `start_pilot`."""
+        return [cast("type", partial(SharedLink, self._ends[name]))]  # cflib calls a driver's class to make a link
 
     def hand_over(self) -> None:
-        """Close this process's copies of the pilots' sockets, so that the end of a pilot closes its socket."""
+        """Close this process's copies of the pilots' sockets, so that a pilot's socket closes when it ends."""
         for end in self._ends.values():
             end.close()
 
@@ -169,7 +171,7 @@ class SharedDongles:
     def __exit__(self, *_: object) -> None:
         self.hand_over()
         for process in self.processes.values():
-            process.join(_ENDS_WITHIN)
+            process.join(_END_TIMEOUT)
             if process.is_alive():
                 process.kill()
 
@@ -184,9 +186,9 @@ def _run(dongle: str, links: Sequence[tuple[str, socket.socket]], open_radio: Op
     with contextlib.suppress(OSError):
         os.setsid()  # the terminal's signals are for the main process
     for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTSTP, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # pilots land first
+        signal.signal(number, signal.SIG_IGN)  # the vehicles must land first
     ends = [end for _, end in links]
-    select.select(ends, [], [])  # until a pilot opens its link, or all have ended
+    select.select(ends, [], [])  # until a pilot opens its link or ends
     try:
         with _opened(dongle, open_radio) as radio:
             _enter_real_time()
@@ -194,7 +196,7 @@ def _run(dongle: str, links: Sequence[tuple[str, socket.socket]], open_radio: Op
     except Exception as error:  # cflib and pyusb raise many types
         reason = error.what if isinstance(error, CfplanError) else f"the Crazyradio failed: {error}"
         for end in ends:
-            _tell(end, _Kind.LOST, reason.encode())
+            _send(end, _MessageKind.LOST, reason.encode())
     os._exit(0)
 
 
@@ -216,14 +218,14 @@ def _serve(radio: SharedRadio, links: Sequence[tuple[str, socket.socket]]) -> No
     dongle = SharedDongle(radio, list(vehicles.values()), REAL_CLOCK)
     wait, alive = 0.0, REAL_CLOCK.now()
     while vehicles:
-        for end in select.select(list(vehicles), [], [], min(wait, _LONGEST_WAIT))[0]:
-            if not _take(end, vehicles[end]):
+        for end in select.select(list(vehicles), [], [], min(wait, _MAX_WAIT))[0]:
+            if not _process_message(end, vehicles[end]):
                 vehicles.pop(end).open = False
         wait = dongle.serve()
         if REAL_CLOCK.now() - alive > _ALIVE_PERIOD:
             alive = REAL_CLOCK.now()
             for end in vehicles:
-                _tell(end, _Kind.ALIVE)
+                _send(end, _MessageKind.ALIVE)
 
 
 def _vehicle(uri: str, end: socket.socket) -> SharedVehicle:
@@ -232,32 +234,32 @@ def _vehicle(uri: str, end: socket.socket) -> SharedVehicle:
     _, channel, rate, address, _ = RadioDriver.parse_uri(uri)
     return SharedVehicle(
         RadioAddress(channel, rate, tuple(address)),
-        hear=lambda packet: _tell(end, _Kind.PACKET, packet),
-        fail=lambda reason: _tell(end, _Kind.LOST, reason.encode()),
+        hear=lambda packet: _send(end, _MessageKind.PACKET, packet),
+        fail=lambda reason: _send(end, _MessageKind.LOST, reason.encode()),
     )
 
 
-def _take(end: socket.socket, vehicle: SharedVehicle) -> bool:
-    """Take a message of a pilot; return whether the pilot has not ended."""
+def _process_message(end: socket.socket, vehicle: SharedVehicle) -> bool:
+    """Process one message from a pilot; return False if the pilot has ended."""
     try:
-        message = end.recv(_LONGEST_MESSAGE)
+        message = end.recv(_MAX_MESSAGE)
     except OSError:
         message = b""
     if not message:
         return False
-    kind, content = _Kind(message[0]), message[1:]
-    if kind in (_Kind.OPEN, _Kind.OPEN_PLAIN):
-        vehicle.begin(REAL_CLOCK.now(), safelink=kind is _Kind.OPEN)
-        _tell(end, _Kind.OPENED)
-    elif kind is _Kind.CLOSE:
+    kind, content = _MessageKind(message[0]), message[1:]
+    if kind in (_MessageKind.OPEN, _MessageKind.OPEN_PLAIN):
+        vehicle.begin(REAL_CLOCK.now(), safelink=kind is _MessageKind.OPEN)
+        _send(end, _MessageKind.OPENED)
+    elif kind is _MessageKind.CLOSE:
         vehicle.open = False
     elif vehicle.open:
-        vehicle.put(content[_SENT.size :], *_SENT.unpack_from(content))
+        vehicle.put(content[_SEND_TIME.size :], *_SEND_TIME.unpack_from(content))
     return True
 
 
 def _enter_real_time() -> None:
-    """Run in real time, ahead of ordinary programs, as pilots do."""
+    """Run in real time, as pilots do: no garbage collection, and scheduled before ordinary programs."""
     gc.collect()
     gc.freeze()
     gc.disable()

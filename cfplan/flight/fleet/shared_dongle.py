@@ -1,10 +1,11 @@
-"""One Crazyradio for several vehicles: which packet it transmits next, and to which vehicle.
+"""One Crazyradio for several vehicles: decides which packet it transmits next, and to which vehicle.
 
-Vehicles take turns; the one that was served longest ago is next. A vehicle without a packet is polled, as its own
-packets come with acknowledgements. One that does not acknowledge is tried more seldom, so that it does not take the
+Vehicles take turns; the one that was served longest ago is next. A vehicle for which no packet waits is polled, as its
+own packets come with acknowledgements. One that does not acknowledge is tried less often, so that it does not take the
 time of the others.
 
-Safelink and packets that perish are as in radio/dongle.py. Of each vehicle one setpoint and one pose wait: the newest.
+Safelink and the expiry of packets are as in radio/dongle.py. For each vehicle, only its newest setpoint and its newest
+pose wait.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,12 +20,12 @@ from cfplan.flight.radio.dongle import DEAD_AFTER
 from cfplan.flight.radio.perishable import Outbox, is_perishable
 
 PACE = 0.002  # s, least time between packets to one vehicle, whose radio queue holds 5
-NEVER_HEARD_AFTER = 3.0  # s without an acknowledgement since the link was opened
-RADIO_DEAD_AFTER = Timeouts().motors_off  # s without a report of the radio; no vehicle flies on then
-_POLL_PERIOD, _QUICK_POLLS = 0.01, 3  # s between polls; after a packet came, that many polls follow at the pace
-_LONGEST_BACK_OFF = 0.03  # s between attempts to reach a vehicle that acknowledges nothing
-_MOST_WAITING = 16  # packets of one vehicle
-_NO_REPORT_PAUSE = 0.001  # s; an unplugged radio fails at once
+NEVER_HEARD_AFTER = 3.0  # s after the link was opened, without any acknowledgement: the link is lost
+RADIO_DEAD_AFTER = Timeouts().motors_off  # s without a report: all links are lost; by then no vehicle flies
+_POLL_PERIOD, _QUICK_POLLS = 0.01, 3  # s between polls; after a vehicle's packet, this many follow at PACE
+_MAX_BACKOFF = 0.03  # s between attempts to reach a vehicle that acknowledges nothing
+_MAX_WAITING = 16  # packets for one vehicle; then the oldest is dropped
+_NO_REPORT_PAUSE = 0.001  # s after an exchange without a report: an unplugged radio fails at once
 _SAFELINK, _SAFELINK_ATTEMPTS = bytes((0xFF, 0x05, 0x01)), 10  # see radio/dongle.py
 _PING = Port.LINK << 4  # header of a ping, without the counters
 _UP, _DOWN = 3, 2  # bits of the counters in the header
@@ -32,56 +33,57 @@ _COUNTERS = 1 << _UP | 1 << _DOWN
 
 
 class SharedRadio(Protocol):
-    """A radio that transmits each packet to another vehicle."""
+    """A radio that can send each packet to a different vehicle."""
 
     def exchange(self, to: RadioAddress, frame: bytes) -> bytes | None:
-        """Transmit; return the content of the acknowledgement, None without one. Raises OSError without a report."""
+        """Transmit; return the acknowledgement's content, or None if there is none. Raises OSError without a report."""
 
     def close(self) -> None:
-        """Let go of the radio."""
+        """Release the radio."""
 
 
 class SharedVehicle:
-    """A vehicle of a shared dongle: its waiting packets, and the state of its link."""
+    """One vehicle on a shared dongle: the packets that wait for it, and the state of its link."""
 
     def __init__(self, address: RadioAddress, hear: Callable[[bytes], None], fail: Callable[[str], None]):
-        """`hear` gets each packet of the vehicle, and `fail` why its link is lost."""
+        """Take an address; `hear` gets each packet from the vehicle, and `fail` the reason why its link is lost."""
         self.address, self.hear, self.fail = address, hear, fail
         self.open = False
-        self.served = 0.0  # s, when it had its last turn
+        self.served_at = 0.0  # s, its last turn
 
     def begin(self, now: float, *, safelink: bool = True) -> None:
         """Open the link. Without safelink, `hear` also gets empty acknowledgements."""
         self.open, self.acknowledged = True, now
         self._outbox, self._waiting = Outbox(), dict[bytes, tuple[float, bytes]]()
-        self._asks = _SAFELINK_ATTEMPTS if safelink else 0  # for safelink, that are left
+        self._safelink_attempts = _SAFELINK_ATTEMPTS if safelink else 0  # left
         self._plain, self._safelink = not safelink, False
         self._heard = False
         self._up = self._down = self._failures = self._empty = 0
-        self._next = self._poll = now  # s, when it may be served, and when it is polled
+        self._next = self._poll = now  # s: when it may be served, and when it is polled
 
     def put(self, packet: bytes, sent: float) -> None:
-        """Add a packet that its pilot sent at a time, s; it replaces an older one of its kind.
+        """Add a packet that the pilot sent at `sent`, s; it replaces an older setpoint, pose or ping, or its equal.
 
-        A pose takes the place of the older one, so that setpoints do not always go first; all else stays in order.
+        A pose keeps the place of the one that it replaces, so that setpoints do not always go first; any other packet
+        goes to the end.
         """
         newest = is_perishable(packet) or packet[0] & ~_COUNTERS == _PING
         kind = packet[:1] if newest else packet
         if packet[0] >> 4 != Port.LOCALIZATION:
             self._waiting.pop(kind, None)
         self._waiting[kind] = sent, packet
-        if len(self._waiting) > _MOST_WAITING:
+        if len(self._waiting) > _MAX_WAITING:
             del self._waiting[next(iter(self._waiting))]
 
     @property
     def turn(self) -> float:
-        """Return when, s, its next turn is: a time that has passed if it is due."""
+        """Return when, s, its next turn is due; this may be in the past."""
         return self._next if self._waiting or not self._outbox.empty else max(self._next, self._poll)
 
     def frame(self, now: float) -> bytes:
-        """Return what to transmit."""
-        self.served = now
-        if self._asks:
+        """Return the frame to transmit now, s."""
+        self.served_at = now
+        if self._safelink_attempts:
             return _SAFELINK
         if self._outbox.empty and self._waiting:
             sent, packet = self._waiting.pop(next(iter(self._waiting)))
@@ -92,19 +94,19 @@ class SharedVehicle:
         return bytes((header, *rest))
 
     def unanswered(self, now: float) -> None:
-        """Note that the frame was not acknowledged."""
+        """Record that the frame was not acknowledged."""
         self._failures += 1
-        self._next = now + min(PACE * self._failures, _LONGEST_BACK_OFF)
+        self._next = now + min(PACE * self._failures, _MAX_BACKOFF)
         if now - self.acknowledged > (DEAD_AFTER if self._heard else NEVER_HEARD_AFTER):
             self.open = False
             self.fail("the vehicle acknowledges nothing: is it on, and are channel, rate and address right?")
 
     def answered(self, content: bytes, now: float) -> None:
-        """Note the acknowledgement of the frame, with its content."""
+        """Record the acknowledgement of the frame, and pass its content on."""
         self.acknowledged, self._heard, self._failures, self._next = now, True, 0, now + PACE
-        if self._asks:
+        if self._safelink_attempts:
             self._safelink = content == _SAFELINK
-            self._asks = 0 if self._safelink else self._asks - 1
+            self._safelink_attempts = 0 if self._safelink else self._safelink_attempts - 1
             return
         self._outbox.acknowledged()
         self._up = 1 - self._up
@@ -118,14 +120,14 @@ class SharedVehicle:
 
 
 class SharedDongle:
-    """Gives each vehicle its turns."""
+    """A Crazyradio that serves several vehicles in turn."""
 
     def __init__(self, radio: SharedRadio, vehicles: Sequence[SharedVehicle], clock: Clock):
         self._radio, self._vehicles, self._clock = radio, vehicles, clock
         self._reported = clock.now()
 
     def serve(self) -> float:
-        """Give one vehicle its turn; return how long, s, until the next one is due.
+        """Serve the vehicle that is due, if any; return the time, s, until the next turn.
 
         Raises LinkError if the radio has not reported for RADIO_DEAD_AFTER.
         """
@@ -133,7 +135,7 @@ class SharedDongle:
         vehicles = [(each, each.turn) for each in self._vehicles if each.open]
         due = [each for each, turn in vehicles if turn <= now]
         if due:
-            self._exchange(min(due, key=lambda each: each.served), now)
+            self._exchange(min(due, key=lambda each: each.served_at), now)
             return 0.0
         return min((turn for _, turn in vehicles), default=now + _POLL_PERIOD) - now
 

@@ -33,7 +33,7 @@ from cfplan.simulation.virtual_vicon.faults import Seen
 PERIOD = 0.01  # s between looks of the room and of the conductor
 _SETTLING = 0.1  # s until a supervisor has disarmed its vehicle, and the truth shows it
 _AFTERWARDS = 6.0  # s that vehicles get to come to rest after the last pilot has ended
-_LEFT_ALONE = 36.0  # s that those get which do not arm themselves: on the floor one disarms 30 s after arming
+_LEFT_ALONE = 36.0  # s, the same for those that must disarm; on the floor they do so 30 s after arming
 _FLYING = (State.FLYING, State.WARNING_LEVEL_OUT)
 ARMED = (State.ARMING, State.READY_TO_FLY, *_FLYING, State.LANDED)
 Message = PilotMessage | FlightEnded | Telemetry
@@ -133,17 +133,17 @@ class VehicleLab(SteppedLab):
 
     @property
     def must_disarm(self) -> bool:
-        """Return whether the vehicle, which does not arm itself, ends disarmed."""
+        """Return whether a flight must end with the vehicle disarmed: only one that does not arm itself stays so."""
         return self.vehicle.settings.auto_arming is False
 
     def pull_dongle(self) -> None:
-        """Let the dongle be gone from now on, which its driver reports at once."""
+        """Remove the dongle for the rest of the flight; its driver reports that at once."""
         self.disturb(RadioFault(RadioFaultKind.DEAD))
         if self.link is not None:
-            self.link._session.fail("the Crazyradio failed")  # as the dongle's driver does
+            self.link._session.fail("the Crazyradio failed")  # what the driver of a dongle calls
 
     def connect(self, hear: Callable[[Telemetry], None]) -> Link:
-        """Connect the pilot, and keep its link."""
+        """Connect the pilot, and keep its link for `pull_dongle`."""
         self.link = connect(self, hear)
         return self.link
 

@@ -28,7 +28,7 @@ def _own_locks(monkeypatch, tmp_path):
 
 
 class Pilot:
-    """A pilot's link, and what it hears."""
+    """A pilot's link, and the reasons for which it was lost."""
 
     def __init__(self, dongles: SharedDongles, name: str, options: str = ""):
         (make,) = dongles.drivers(name)
@@ -46,7 +46,7 @@ class Pilot:
         return True
 
     def answer_to(self, *content: int) -> bytes | None:
-        """Send a packet until it comes back; None if the link is lost."""
+        """Send a packet until it comes back, and return it; None if the link is lost."""
         while not self.failures:
             self.link.send_packet(CRTPPacket(0x2E, bytearray(content)))
             packet = self.link.receive_packet(0.2)
@@ -68,7 +68,7 @@ def pid(dongles) -> int:
     return dongles.processes["0"].pid
 
 
-def test_two_pilots_reach_each_its_vehicle_and_no_other(dongles):
+def test_each_of_two_pilots_reaches_its_own_vehicle_only(dongles):
     left, right = Pilot(dongles, "left"), Pilot(dongles, "right")
     for number in range(5):
         assert left.answer_to(1, number) == bytes((0x2E, 1, number))
@@ -83,7 +83,7 @@ def test_each_pilot_loses_its_link_at_once_when_the_process_dies(dongles):
     for pilot in pilots:
         assert pilot.loses_its_link()
         assert pilot.failures == ["the dongle's process has ended"]
-        pilot.link.send_packet(CRTPPacket(0x2E, bytearray(b"\1")))  # is dropped
+        pilot.link.send_packet(CRTPPacket(0x2E, bytearray(b"\1")))  # dropped without an error
         with pytest.raises(LinkError, match="has ended"):
             pilot.link.connect("shared://0", None, None)
 
@@ -95,7 +95,7 @@ def test_each_pilot_loses_its_link_when_the_process_hangs(dongles):
         for pilot in pilots:
             assert pilot.loses_its_link()
             assert "silent" in pilot.failures[0]
-            for _ in range(10_000):  # never waits for the process, however much it holds
+            for _ in range(10_000):  # never blocks, even when the process's socket is full
                 pilot.link.send_packet(CRTPPacket(0x2E, bytearray(b"\1")))
     finally:
         os.kill(pid(dongles), signal.SIGCONT)
@@ -118,8 +118,8 @@ def test_the_process_ends_with_its_last_pilot(dongles):
     lock_radio("radio://0/80").close()
 
 
-def test_a_plain_link_after_another_hears_that_the_radio_of_its_vehicle_has_the_packet(dongles):
-    """So cflib restarts a vehicle; a link with safelink hears no empty acknowledgement."""
+def test_a_plain_link_after_another_hears_that_its_vehicle_acknowledged_a_packet(dongles):
+    """cflib needs this to restart a vehicle; a link with safelink does not pass on empty acknowledgements."""
     pilot = Pilot(dongles, "left")
     assert pilot.answer_to(1)
     pilot.link.close()
@@ -128,7 +128,7 @@ def test_a_plain_link_after_another_hears_that_the_radio_of_its_vehicle_has_the_
     assert until(lambda: getattr(again.link.receive_packet(0.1), "header", 0) == 0xFF)
 
 
-def test_a_link_that_is_opened_again_at_once_is_not_robbed_by_a_reader_of_the_one_before(dongles):
+def test_the_reader_of_a_closed_link_takes_no_packet_of_the_next_link(dongles):
     first = Pilot(dongles, "left").link
     for _ in range(10):
         ended = threading.Event()

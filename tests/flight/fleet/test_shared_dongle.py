@@ -1,4 +1,4 @@
-"""Several vehicles on one Crazyradio that is not there: each gets its packets in time, whatever the others do."""
+"""Several vehicles on one simulated Crazyradio: each gets its packets in time, whatever the others do."""
 
 import struct
 
@@ -24,7 +24,7 @@ CUT = pack(Port.SUPERVISOR, 1, b"\x03")
 
 
 def setpoint(number: int) -> bytes:
-    """A setpoint whose x is a number of millimetres."""
+    """Return a setpoint packet with x = `number` mm."""
     position = np.array([[1e-3 * number, 0.0, 1.0]])
     level = np.array([[0.0, 0.0, 0.0, 1.0]])
     still = np.zeros((1, 3))
@@ -40,7 +40,7 @@ def numbered(number: int) -> bytes:
 
 
 class Shared:
-    """A shared dongle on a stepped clock, with a pilot's ends of each vehicle."""
+    """A shared dongle on a stepped clock, and what the pilot of each vehicle sends and hears."""
 
     def __init__(self, *vehicles: RadioVehicle):
         self.clock = SteppedClock()
@@ -60,13 +60,13 @@ class Shared:
         self.links[number].put(packet, self.clock.now())
 
     def run(self, duration: float) -> None:
-        """Let so much time pass."""
+        """Serve the vehicles for `duration`, s."""
         end = self.clock.now() + duration
         while self.clock.now() < end:
             self.clock.sleep(min(self.dongle.serve(), max(end - self.clock.now(), 0.0)))
 
     def fly(self, ticks: int) -> None:
-        """Send a setpoint and a pose to each vehicle at each tick, while each sends two packets."""
+        """Send each vehicle a setpoint and a pose at every tick; each vehicle that is on sends two packets."""
         began = self.clock.now()
         for tick in range(ticks):
             for number, radio in enumerate(self.radios):
@@ -77,14 +77,14 @@ class Shared:
             self.run(max(began + (tick + 1) * TICK - self.clock.now(), 0.0))
 
     def got(self, number: int, port: Port) -> list[float]:
-        """The numbers of the setpoints or poses that a vehicle has received."""
+        """Return the numbers of the setpoints or poses that a vehicle has received."""
         packets = [packet for packet in self.radios[number].received if packet[0] >> 4 == port]
         if port is Port.SETPOINT:
             return [struct.unpack_from("<h", packet, 2)[0] for packet in packets]
         return [struct.unpack_from("<f", packet, 2)[0] for packet in packets]
 
 
-def test_over_a_lossy_radio_each_packet_comes_once_and_in_order_both_ways():
+def test_over_a_lossy_radio_each_packet_arrives_once_and_in_order_both_ways():
     shared = Shared(*(RadioVehicle(loss=0.3) for _ in range(3)))
     for number in range(60):
         for vehicle, radio in enumerate(shared.radios):
@@ -109,7 +109,7 @@ def test_four_vehicles_get_each_setpoint_and_each_pose():
 
 def test_vehicles_share_a_slow_radio_fairly():
     shared = Shared(*(RadioVehicle() for _ in range(4)))
-    shared.usb.air_time = 0.002  # s; half of the packets find room
+    shared.usb.air_time = 0.002  # s; there is time for about half of the packets
     shared.fly(200)
     counts = [len(radio.received) for radio in shared.radios]
     assert max(counts) < 350  # of 400
@@ -118,7 +118,7 @@ def test_vehicles_share_a_slow_radio_fairly():
         assert len(shared.got(vehicle, Port.SETPOINT)) == pytest.approx(counts[vehicle] / 2, rel=0.2)
 
 
-def test_a_vehicle_that_is_off_takes_no_packet_of_the_others():
+def test_a_vehicle_that_is_off_costs_the_others_no_packet():
     shared = Shared(*(RadioVehicle() for _ in range(4)))
     shared.run(0.1)
     shared.radios[0].off = True
@@ -129,7 +129,7 @@ def test_a_vehicle_that_is_off_takes_no_packet_of_the_others():
         assert shared.got(vehicle, Port.LOCALIZATION) == list(range(200))
 
 
-def test_what_waited_for_a_vehicle_that_was_off_does_not_come_but_an_order_to_cut_does():
+def test_a_vehicle_that_was_off_gets_an_order_to_cut_but_no_expired_setpoint_or_pose():
     shared = Shared(RadioVehicle(), RadioVehicle())
     shared.run(0.1)
     shared.radios[0].off = True
@@ -143,7 +143,7 @@ def test_what_waited_for_a_vehicle_that_was_off_does_not_come_but_an_order_to_cu
     assert len(shared.radios[0].received) <= 3
 
 
-def test_a_packet_that_its_pilot_sent_too_long_ago_is_not_sent_on():
+def test_a_packet_that_expires_on_its_way_to_the_dongle_is_not_transmitted():
     shared = Shared(RadioVehicle())
     shared.run(0.1)
     shared.links[0].put(pose(1), shared.clock.now() - 2.0 * MAX_AGE)
@@ -151,7 +151,7 @@ def test_a_packet_that_its_pilot_sent_too_long_ago_is_not_sent_on():
     assert not shared.radios[0].received
 
 
-def test_an_order_to_stop_comes_before_a_newer_setpoint_and_after_no_older_one():
+def test_an_order_to_stop_comes_before_a_newer_setpoint_which_replaces_the_older_one():
     shared = Shared(RadioVehicle())
     shared.run(0.1)
     for packet in (setpoint(1), STOP, setpoint(2)):
@@ -205,7 +205,7 @@ def test_a_vehicle_that_is_off_for_long_is_lost_and_the_others_are_not():
     assert not shared.failures[1]
 
 
-def test_a_vehicle_that_never_answers_is_known_before_its_pilot_gives_up():
+def test_a_vehicle_that_never_answers_is_reported_before_its_pilot_gives_up():
     shared = Shared(RadioVehicle(), RadioVehicle())
     shared.radios[0].off = True
     shared.run(FIRST_ANSWER_TIMEOUT - 0.5)
@@ -236,7 +236,7 @@ def test_a_radio_that_does_not_report_for_long_is_given_up():
 
 
 def test_a_plain_link_hears_empty_acknowledgements_too():
-    """So cflib restarts a vehicle: by packets that its radio acknowledges while its main processor is off."""
+    """cflib restarts a vehicle by packets that its radio acknowledges while its main processor is off."""
     shared = Shared(RadioVehicle())
     shared.links[0].begin(shared.clock.now(), safelink=False)
     shared.put(0, b"\xff\xfe\x02")

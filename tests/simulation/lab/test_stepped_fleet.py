@@ -285,7 +285,7 @@ def test_a_vehicle_that_does_not_arm_keeps_the_other_on_the_floor():
 
 
 def test_a_dongle_pulled_before_take_off_ends_with_all_disarmed():
-    """The vehicle hears nothing any more: it disarms by itself, 30 s after it was armed."""
+    """The vehicle hears no order any more, so it disarms by itself, 30 s after arming."""
     fleet = fleet_of()
     lab = fleet.labs["left"]
 
