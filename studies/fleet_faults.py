@@ -59,7 +59,7 @@ class Kind(StrEnum):
 
     LINK = "link lost"  # for BACK or longer
     SHORT_LINK = "link lost briefly"  # for less
-    DONGLE = "dongle pulled"  # its pilot notices at once
+    DONGLE = "dongle of two lost"
     PILOT = "pilot killed"
     STALL = "pilot stalled"
     CONDUCTOR = "conductor silent"
@@ -76,11 +76,12 @@ class Kind(StrEnum):
     ORDER = "order to brake lost to one"  # while another vehicle lands
 
 
-_LOST = (Kind.LINK, Kind.DONGLE, Kind.PILOT, Kind.STALL, Kind.TUMBLE, Kind.LOCK)  # the vehicle may leave its path
+_LOST = (Kind.LINK, Kind.PILOT, Kind.STALL, Kind.TUMBLE, Kind.LOCK)  # the vehicle may leave its path
 _COVERED = "covered by the certificate"
 _WITHOUT_POSES = "left out: drift without poses"
 _LEFT_OUT = {
     Kind.SHORT_LINK: "left out: short loss of a link",
+    Kind.DONGLE: "left out: two lost at once that have a dongle each",
     Kind.POSES: _WITHOUT_POSES,
     Kind.ALL_POSES: _WITHOUT_POSES,
     Kind.LATE: _WITHOUT_POSES,  # the pilot does not use late poses
@@ -135,7 +136,7 @@ class FleetFault:
     def __str__(self) -> str:
         size = {Kind.BATTERY: f" {self.size:.2f} V", Kind.LATE: f" {self.size:.2f} s"}
         size[Kind.ALL_LATE] = size[Kind.LATE]
-        two = f" and {self.other}" if self.kind in (Kind.SWAPPED, Kind.ORDER) else ""
+        two = f" and {self.other}" if self.kind in (Kind.DONGLE, Kind.SWAPPED, Kind.ORDER) else ""
         ends = f" for {self.duration:.2f} s" if math.isfinite(self.duration) else ""
         return f"{self.kind}{size.get(self.kind, '')}{ends}: {self.vehicle}{two}, {self.moment:.2f} s"
 
@@ -357,7 +358,8 @@ def strike(fault: FleetFault, fleet: SteppedFleet) -> None:
         case Kind.LINK | Kind.SHORT_LINK:
             lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, lasts))
         case Kind.DONGLE:
-            lab.pull_dongle()
+            for each in (lab, fleet.labs[fault.other]):
+                each.disturb(RadioFault(RadioFaultKind.DEAD))
         case Kind.PILOT:
             lab.kill_pilot()
         case Kind.STALL:

@@ -101,6 +101,7 @@ class InlineCrazyradio:
         self.log: list[tuple[int, bytes]] = []  # last byte of the address, and frame
         self.late = False  # the next answer comes after the time-out
         self.broken = False
+        self.short = False  # the next answer is cut short
         self.air_time = AIR_TIME
         self._answers: deque[bytes] = deque()
 
@@ -129,7 +130,10 @@ class InlineCrazyradio:
             self.late = False
             self._pass_time(1e-3 * timeout)
             raise USBTimeoutError("timed out", None, errno.ETIMEDOUT)
-        return array("B", self._answers.popleft())
+        answer = self._answers.popleft()
+        if self.short:
+            self.short, answer = False, answer[:1]
+        return array("B", answer)
 
     def close(self):
         self.closed = True

@@ -32,7 +32,7 @@ from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 from cfplan.vehicle.airframe import GRAVITY
 
 _TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
-_BLIND = 2.0  # s in which a vehicle without poses brakes and comes down
+_BLIND = 2.0  # s, about, in which a vehicle without poses brakes and comes down; after 3 s its motors stop
 _CEILING = FLOOR + 3  # its number among the faces
 _SAMPLE = 0.01  # s between the positions of a path that are compared with walls
 _LOST_HINT = "move that path with `place`, or write `lost: warn` in the fleet file"

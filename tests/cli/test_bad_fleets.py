@@ -60,6 +60,7 @@ def fly(cfplan, safety_file, tmp_path, monkeypatch):
         (radio(0, "01"), "uri: 'radio://0/110/2M/E7E7E7E702'", MOCAP, 2, "does not transmit on channel 110"),
         (radio(0, "01"), "uri: 'radio://0/80/250K/E7E7E7E702'", MOCAP, 2, "does not transmit on channel 80 at 250K"),
         (radio("E7E7E7E7E7", "01"), radio("E7E7E7E7E7", "02"), MOCAP, 2, "named by its serial number"),
+        (radio("1234567890", "01"), radio("1234567890", "02"), MOCAP, 2, "named by its serial number"),
         ("uri: 'radio://0/80/2M/1'", radio(1, "01"), MOCAP, 2, "not an address"),
         ("uri: 'radio://0/200'", radio(1, "01"), MOCAP, 2, "not a channel"),
         ("uri: here", radio(1, "01"), MOCAP, 2, "not the URI of a vehicle"),

@@ -109,11 +109,11 @@ def first_seed(fleet, kind):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("kind", [Kind.DONGLE, Kind.ORDER])
+@pytest.mark.parametrize("kind", [Kind.LOCK, Kind.ORDER])
 def test_a_fault_lets_all_brake_and_the_flight_is_recorded_and_judged(fleet, kind):
     flown = fly_with_fault(first_seed(fleet, kind), {"pair": fleet})
     assert (flown.fleet, flown.vehicles, flown.kind, flown.phase) == ("pair", 2, kind, Phase.STREAM)
-    assert (flown.coverage == "covered by the certificate") == (kind is Kind.DONGLE)
+    assert (flown.coverage == "covered by the certificate") == (kind is Kind.LOCK)
     assert flown.brakes
     assert 0.3 < flown.nearest < 0.6
     assert not flown.bad, flown

@@ -41,6 +41,8 @@ _MAX_WAIT = 0.1  # s for a pilot's message, so that ALIVE messages are sent in t
 _MAX_MESSAGE = 1024  # bytes
 _SEND_TIME = struct.Struct("<d")  # s; precedes each packet from a pilot
 
+_ENDED = b"the dongle's process has ended"
+
 OpenRadio = Callable[[str], SharedRadio]
 
 
@@ -73,6 +75,7 @@ class SharedLink(CRTPDriver):
         self._on_lost: Callable[[str], None] | None = None
         self._heard_at = 0.0
         self._reading, self._closed = threading.RLock(), False
+        self._ended = False  # the process has ended
 
     def connect(
         self, uri: str, radio_link_statistics_callback: object, link_error_callback: Callable[[str], None] | None
@@ -81,14 +84,14 @@ class SharedLink(CRTPDriver):
         if not uri.startswith(SCHEME):
             raise WrongUriType(f"not a {SCHEME} URI")
         _send(self._end, _MessageKind.OPEN_PLAIN if "safelink=0" in uri else _MessageKind.OPEN)
-        until = time.monotonic() + _OPEN_TIMEOUT
-        kind = None
+        until, kind, reason = time.monotonic() + _OPEN_TIMEOUT, None, ""
         while kind is not _MessageKind.OPENED:  # messages for an earlier link are discarded
-            kind, content = self._receive(max(until - time.monotonic(), 0.0))
-            if kind is None:
-                content = b"the dongle's process does not answer"
-            if kind in (None, _MessageKind.LOST):
-                raise LinkError(content.decode(), where=uri, hint="plug the Crazyradio in again")
+            kind, content = self._receive(0.0 if self._ended else max(until - time.monotonic(), 0.0))
+            if kind is None or self._ended:
+                reason = reason or content.decode() or "the dongle's process does not answer"
+                raise LinkError(reason, where=uri, hint="plug the Crazyradio in again")
+            if kind is _MessageKind.LOST:  # of an earlier link, unless the process ends now
+                reason = content.decode()
         self._on_lost, self._heard_at = link_error_callback, time.monotonic()
 
     def send_packet(self, pk: CRTPPacket) -> None:
@@ -108,13 +111,17 @@ class SharedLink(CRTPDriver):
         return CRTPPacket(content[0], bytearray(content[1:])) if kind is _MessageKind.PACKET else None
 
     def _receive(self, wait: float) -> tuple[_MessageKind | None, bytes]:
-        """Return the next message, or None after `wait`, s."""
+        """Return the next message, or None after `wait`, s; once the process has ended, None after `wait`."""
+        if self._ended:
+            time.sleep(wait)
+            return None, _ENDED
         if not select.select([self._end], [], [], wait)[0]:
             return None, b""
         try:
             kind, *content = self._end.recv(_MAX_MESSAGE)
         except (OSError, ValueError):  # an empty message, which cannot be unpacked: the other end has closed
-            return _MessageKind.LOST, b"the dongle's process has ended"
+            self._ended = True
+            return _MessageKind.LOST, _ENDED
         return _MessageKind(kind), bytes(content)
 
     def close(self) -> None:
@@ -207,7 +214,8 @@ def _opened(dongle: str, open_radio: OpenRadio) -> Iterator[SharedRadio]:
     try:
         yield radio
     finally:
-        radio.close()
+        with contextlib.suppress(OSError):  # an unplugged radio; why it failed is known already
+            radio.close()
         if lock is not None:
             lock.close()
 
@@ -224,8 +232,9 @@ def _serve(radio: SharedRadio, links: Sequence[tuple[str, socket.socket]]) -> No
         wait = dongle.serve()
         if REAL_CLOCK.now() - alive > _ALIVE_PERIOD:
             alive = REAL_CLOCK.now()
-            for end in vehicles:
-                _send(end, _MessageKind.ALIVE)
+            for end, vehicle in vehicles.items():
+                if vehicle.open:  # else its pilot notices the silence, even if it did not get the reason
+                    _send(end, _MessageKind.ALIVE)
 
 
 def _vehicle(uri: str, end: socket.socket) -> SharedVehicle:

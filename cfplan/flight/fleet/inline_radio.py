@@ -17,9 +17,10 @@ from cfplan.flight.setpoints.encoding import RATE
 PACKETS_PER_VEHICLE = RATE + RATE + 1.0 / PING_PERIOD  # a second: setpoints, poses and pings
 USABLE_FRACTION = 0.75  # of a dongle's capacity; the rest is for repetitions and for packets that vehicles send
 _INLINE_SINCE = 0x0501  # firmware version of a Crazyradio 2.0, as in its USB descriptor
+_SERIAL_DIGITS = 10  # of the serial number of a dongle, whose place in the list has fewer
 _HIGHEST_CHANNEL, _SLOWEST_RATE = 100, "250K"  # a Crazyradio 2.0 ignores higher channels, and this rate
 _VENDOR_REQUEST, _SET_INLINE_MODE = 0x40, 0x23
-_OUT, _IN, _MAX_ANSWER = 0x01, 0x81, 64  # USB endpoints; bytes
+_OUT, _IN, _MAX_ANSWER, _ANSWER_HEADER = 0x01, 0x81, 64, 2  # USB endpoints; bytes
 _ACKNOWLEDGE, _ACKNOWLEDGED = 0x10, 0x01  # bits in the second byte of a header and of an answer
 _TIMEOUT, _DRAIN_TIMEOUT = 100, 50  # ms; an exchange takes 1 ms, or 4 ms without an acknowledgement
 
@@ -65,7 +66,7 @@ def require_capacity(dongle: str, vehicles: Sequence[str], mode: DongleMode) -> 
 def require_inline_settings(uri: str) -> None:
     """Raise InputError if a valid radio URI has a serial number, or a channel or rate that inline mode lacks."""
     dongle, channel, rate, *_ = [*uri.removeprefix("radio://").partition("?")[0].split("/"), "", ""]
-    if not dongle.isdecimal():
+    if not dongle.isdecimal() or len(dongle) >= _SERIAL_DIGITS:
         raise InputError(f"the shared dongle {dongle} is named by its serial number", where=uri,
                          hint="name a shared dongle by its number, as in radio://0")  # fmt: skip
     if int(channel) > _HIGHEST_CHANNEL or rate == _SLOWEST_RATE:
@@ -96,18 +97,21 @@ class InlineRadio:
     def exchange(self, to: RadioAddress, frame: bytes) -> bytes | None:
         """Transmit a frame; return the content of the acknowledgement, or None if there is none.
 
-        Raises usb.core.USBError, after discarding late answers: without an address they would count for the next frame.
+        Raises OSError, of which usb.core.USBError is one, after discarding late answers: without an address they would
+        count for the next frame.
         """
         header = bytes((8 + len(frame), _ACKNOWLEDGE | to.rate, to.channel, *to.address))
         try:
             self._usb.write(_OUT, header + frame, _TIMEOUT)
             answer = bytes(self._usb.read(_IN, _MAX_ANSWER, _TIMEOUT))
+            if len(answer) < _ANSWER_HEADER:
+                raise OSError(f"an answer of {len(answer)} bytes")
         except OSError:
             with suppress(OSError):
                 while True:
                     self._usb.read(_IN, _MAX_ANSWER, _DRAIN_TIMEOUT)
             raise
-        return answer[2 : answer[0]] if answer[1] & _ACKNOWLEDGED else None
+        return answer[_ANSWER_HEADER : answer[0]] if answer[1] & _ACKNOWLEDGED else None
 
     def close(self) -> None:
         self._radio.close()

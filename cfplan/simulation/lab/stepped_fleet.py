@@ -18,7 +18,6 @@ from cfplan.flight.pilot.keys import HeldOrders
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
 from cfplan.flight.pilot.pilot import Pilot
-from cfplan.flight.radio.link import Link
 from cfplan.flight.telemetry import Quaternion, Telemetry, Triple
 from cfplan.simulation.lab.downwash import Contact, contacts, share_air
 from cfplan.simulation.lab.lab import Truth
@@ -127,7 +126,6 @@ class VehicleLab(SteppedLab):
         self.body: SteppedLab = self  # the vehicle that its cameras take for this one
         self.cameras = _BodyCameras(ViconSettings(seed=7 + seed), self._body_seen)
         self.orders = HeldOrders()
-        self.link: Link | None = None  # of its pilot, once it has connected
         self.deaf = False  # the conductor's messages do not reach its pilot
         self.died = False
 
@@ -135,17 +133,6 @@ class VehicleLab(SteppedLab):
     def must_disarm(self) -> bool:
         """Return whether a flight must end with the vehicle disarmed: only one that does not arm itself stays so."""
         return self.vehicle.settings.auto_arming is False
-
-    def pull_dongle(self) -> None:
-        """Remove the dongle for the rest of the flight; its driver reports that at once."""
-        self.disturb(RadioFault(RadioFaultKind.DEAD))
-        if self.link is not None:
-            self.link._session.fail("the Crazyradio failed")  # what the driver of a dongle calls
-
-    def connect(self, hear: Callable[[Telemetry], None]) -> Link:
-        """Connect the pilot, and keep its link for `pull_dongle`."""
-        self.link = connect(self, hear)
-        return self.link
 
     def kill_pilot(self) -> None:
         """Let the pilot's process die now: nothing of it reaches the vehicle any more. Call it in the pilot's turn."""
@@ -254,7 +241,7 @@ class SteppedFleet:
         )
         pilot = Pilot(
             mission,
-            connect=lambda _: lab.connect(hear),
+            connect=lambda _: connect(lab, hear),
             source=SteppedPoses(lab, mission.limits.pose),
             report=hear,
             orders=lab.orders,

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import time
 from functools import partial
 
 import pytest
@@ -13,6 +14,7 @@ from waiting import a_moment, until
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
 from cfplan.flight.fleet.inline_radio import dongle_mode, require_capacity
+from cfplan.flight.fleet.shared_dongle import NEVER_HEARD_AFTER
 from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.radio.transport import start_receiver
 
@@ -30,10 +32,10 @@ def _own_locks(monkeypatch, tmp_path):
 class Pilot:
     """A pilot's link, and the reasons for which it was lost."""
 
-    def __init__(self, dongles: SharedDongles, name: str, options: str = ""):
+    def __init__(self, dongles: SharedDongles, name: str, options: str = "", uris: dict[str, str] = URIS):
         (make,) = dongles.drivers(name)
         self.link, self.failures = make(), []
-        assert until(lambda: self._connects(shared_uri(URIS[name]) + options))
+        assert until(lambda: self._connects(shared_uri(uris[name]) + options))
 
     def _connects(self, uri: str) -> bool:
         """Connect; return False while the process has not begun to run."""
@@ -139,6 +141,25 @@ def test_the_reader_of_a_closed_link_takes_no_packet_of_the_next_link(dongles):
         (make,) = dongles.drivers("left")
         first = make()
         first.connect(shared_uri(URIS["left"]), None, None)
+
+
+def test_the_loss_of_an_earlier_link_does_not_fail_the_next():
+    """A reason that came after the earlier link had been closed waits in the socket."""
+    uris = {"absent": "radio://0/80/2M/E7E7E7E709"}
+    with SharedDongles(uris, radio_of_echoing_vehicles) as dongles:
+        link = Pilot(dongles, "absent", uris=uris).link
+        a_moment(NEVER_HEARD_AFTER + 0.5)
+        link.close()
+        assert not Pilot(dongles, "absent", uris=uris).failures
+
+
+def test_a_link_whose_process_has_died_does_not_keep_its_reader_busy(dongles):
+    pilot = Pilot(dongles, "left")
+    os.kill(pid(dongles), signal.SIGKILL)
+    assert pilot.loses_its_link()
+    began = time.monotonic()
+    assert pilot.link.receive_packet(0.1) is None
+    assert time.monotonic() - began >= 0.1
 
 
 def test_a_radio_that_cannot_be_opened_is_an_error_of_each_pilot():

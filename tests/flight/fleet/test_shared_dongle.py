@@ -225,6 +225,17 @@ def test_an_answer_that_comes_late_is_not_taken_for_that_of_another_vehicle():
         assert {unmarked(packet) for packet in shared.heard[vehicle]} == {numbered(vehicle)}
 
 
+def test_an_answer_that_is_cut_short_counts_as_none():
+    shared = Shared(RadioVehicle(), RadioVehicle())
+    shared.run(0.1)
+    shared.usb.short = True
+    shared.put(0, numbered(0))
+    shared.run(0.1)
+    assert not shared.usb.short
+    assert shared.failures == [[], []]
+    assert numbered(0) in [unmarked(packet) for packet in shared.radios[0].received]
+
+
 def test_a_radio_that_does_not_report_for_long_is_given_up():
     shared = Shared(RadioVehicle(), RadioVehicle())
     shared.run(0.1)
