@@ -27,7 +27,7 @@ class VehicleAddress:
 
     @property
     def pilot_uri(self) -> str:
-        """Return the URI by which its pilot reaches it."""
+        """Return the URI that its pilot connects to."""
         return shared_uri(self.uri) if self.dongle else self.uri
 
     @property

@@ -184,7 +184,7 @@ class SharedDongles:
 
 
 def shared_uri(uri: str) -> str:
-    """Return the URI by which a pilot reaches a vehicle over a shared dongle, from its address radio://…."""
+    """Return the address of a vehicle, radio://…, with the scheme of shared dongles."""
     return uri.replace("radio://", SCHEME, 1)
 
 

@@ -97,8 +97,8 @@ class InlineRadio:
     def exchange(self, to: RadioAddress, frame: bytes) -> bytes | None:
         """Transmit a frame; return the content of the acknowledgement, or None if there is none.
 
-        Raises OSError, of which usb.core.USBError is one, after discarding late answers: without an address they would
-        count for the next frame.
+        Raises OSError, also as usb.core.USBError. Late answers are discarded first: they have no address, and would be
+        taken for the answer to the next frame.
         """
         header = bytes((8 + len(frame), _ACKNOWLEDGE | to.rate, to.channel, *to.address))
         try:

@@ -1,4 +1,4 @@
-"""Several vehicles on one simulated Crazyradio: each gets its packets in time, whatever the others do."""
+"""Tests of vehicles that share a simulated Crazyradio: the packets of each arrive in time."""
 
 import struct
 
