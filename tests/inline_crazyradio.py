@@ -2,13 +2,13 @@
 
 import errno
 import socket
-import time
 from array import array
 from collections import deque
 
 import numpy as np
 from usb.core import USBTimeoutError
 
+from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.fleet.inline_radio import InlineRadio
 
 SAFELINK = b"\xff\x05\x01"
@@ -95,7 +95,7 @@ class UdpVehicle(RadioVehicle):
 class InlineCrazyradio:
     """A stand-in for cflib's Crazyradio and its USB handle; `vehicles` by the last byte of their addresses."""
 
-    def __init__(self, vehicles: dict[int, RadioVehicle], pass_time=time.sleep):
+    def __init__(self, vehicles: dict[int, RadioVehicle], pass_time=REAL_CLOCK.sleep):
         self.vehicles, self._pass_time = vehicles, pass_time
         self.handle, self.inline, self.closed = self, False, False
         self.log: list[tuple[int, bytes]] = []  # last byte of the address, and frame

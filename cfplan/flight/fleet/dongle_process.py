@@ -14,7 +14,6 @@ import signal
 import socket
 import struct
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from functools import partial
@@ -84,26 +83,26 @@ class SharedLink(CRTPDriver):
         if not uri.startswith(SCHEME):
             raise WrongUriType(f"not a {SCHEME} URI")
         _send(self._end, _MessageKind.OPEN_PLAIN if "safelink=0" in uri else _MessageKind.OPEN)
-        until, kind, reason = time.monotonic() + _OPEN_TIMEOUT, None, ""
+        until, kind, reason = REAL_CLOCK.now() + _OPEN_TIMEOUT, None, ""
         while kind is not _MessageKind.OPENED:  # messages for an earlier link are discarded
-            kind, content = self._receive(0.0 if self._ended else max(until - time.monotonic(), 0.0))
+            kind, content = self._receive(0.0 if self._ended else max(until - REAL_CLOCK.now(), 0.0))
             if kind is None or self._ended:
                 reason = reason or content.decode() or "the dongle's process does not answer"
                 raise LinkError(reason, where=uri, hint="plug the Crazyradio in again")
             if kind is _MessageKind.LOST:  # of an earlier link, unless the process ends now
                 reason = content.decode()
-        self._on_lost, self._heard_at = link_error_callback, time.monotonic()
+        self._on_lost, self._heard_at = link_error_callback, REAL_CLOCK.now()
 
     def send_packet(self, pk: CRTPPacket) -> None:
-        _send(self._end, _MessageKind.PACKET, _SEND_TIME.pack(time.monotonic()) + bytes((pk.header, *pk.data)))
+        _send(self._end, _MessageKind.PACKET, _SEND_TIME.pack(REAL_CLOCK.now()) + bytes((pk.header, *pk.data)))
 
     def receive_packet(self, wait: float = 0.0) -> CRTPPacket | None:
         """Return the next packet, or None after `wait`, s. Reports once why the link is lost."""
         with self._reading:
             kind, content = self._receive(wait) if not self._closed else (None, b"")
         if kind is not None:
-            self._heard_at = time.monotonic()
-        elif time.monotonic() - self._heard_at > DONGLE_SILENT:
+            self._heard_at = REAL_CLOCK.now()
+        elif REAL_CLOCK.now() - self._heard_at > DONGLE_SILENT:
             kind, content = _MessageKind.LOST, f"the dongle's process has been silent for {DONGLE_SILENT:g} s".encode()
         if kind is _MessageKind.LOST and self._on_lost is not None:
             report, self._on_lost = self._on_lost, None
@@ -113,7 +112,7 @@ class SharedLink(CRTPDriver):
     def _receive(self, wait: float) -> tuple[_MessageKind | None, bytes]:
         """Return the next message, or None after `wait`, s; once the process has ended, None after `wait`."""
         if self._ended:
-            time.sleep(wait)
+            REAL_CLOCK.sleep(wait)
             return None, _ENDED
         if not select.select([self._end], [], [], wait)[0]:
             return None, b""
