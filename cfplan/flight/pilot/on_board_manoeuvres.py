@@ -133,6 +133,7 @@ class OnBoardManoeuvres:
     def fly_plan(self) -> None:
         """Start the trajectory, and watch it until its landing begins."""
         loop = self._loop
+        loop.await_clearance(Phase.STREAM)
         self._history.enter(Phase.STREAM)
         begun = loop.now()
 
