@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from cfplan.cli import options
+from cfplan.cli import fleet, options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
 
@@ -18,7 +18,8 @@ _FORMS = ("crazyswarm", "memory", "compressed", "samples")
 Examples:
   cfplan export flights/circle.yaml --to crazyswarm -o circle.csv
   cfplan export flights/circle.yaml --to memory -o circle.bin
-  cfplan export plan.parquet --to samples -o samples.csv""",
+  cfplan export plan.parquet --to samples -o samples.csv
+  cfplan export flights/fleets/two.yaml --to crazyswarm -o two""",
 )
 @options.path_or_plan
 @options.planning
@@ -29,7 +30,9 @@ Examples:
     type=click.Choice(_FORMS),
     help="Polynomial CSV; the vehicle's trajectory memory, compressed if necessary or always; or a CSV of states.",
 )
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write.")
+@click.option(
+    "-o", "--output", required=True, type=click.Path(path_type=Path), help="File to write; a folder for a fleet."
+)
 @click.option("--plain", is_flag=True, help="Export the plan's motion without corrections for the firmware.")
 @click.option(
     "--pieces", type=click.IntRange(1, 255), help="Maximum number of pieces.  [default: 31, as a vehicle holds]"
@@ -42,10 +45,16 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
 
     Polynomials stay within 2 cm of the plan and within every limit; if they cannot, the entire flight is slowed down.
     The simulator flies them as the vehicle's own commander would.
+
+    For a fleet file: write one file per vehicle, to be started at one time.
     """
     plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
-    _check(form, output, force, pieces)
     steps = Steps(as_json=as_json)
+    is_fleet = fleet.is_fleet(path_or_plan)
+    _check(form, output, pieces, force=force, is_fleet=is_fleet)
+    if is_fleet:
+        settings = fleet.ExportSettings(form, output, leads=not plain, pieces=pieces, rate=rate)
+        return fleet.export_and_print(path_or_plan, safety_file, rest, settings, steps)
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
@@ -73,17 +82,24 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
         print_certificate(certificate)
 
 
-def _check(form: str, output: Path, force: bool, pieces: int | None) -> None:
-    """Raise InputError, before anything is planned, if the file could not be written."""
-    suffix = ".bin" if form in ("memory", "compressed") else ".csv"
-    if output.suffix != suffix:
+def _check(form: str, output: Path, pieces: int | None, *, force: bool, is_fleet: bool) -> None:
+    """Raise InputError, before anything is planned, if the file or folder could not be written."""
+    suffix = "" if is_fleet else ".bin" if form in ("memory", "compressed") else ".csv"
+    if is_fleet and output.suffix in (".bin", ".csv"):
+        raise InputError(
+            "a fleet is written as a folder with a file per vehicle", where=str(output), hint=f"name it {output.stem}"
+        )
+    if not is_fleet and output.suffix != suffix:
         raise InputError(
             f"{form} is written as {suffix}, not as {output.suffix or 'a file without suffix'}",
             where=str(output), hint=f"name it {output.with_suffix(suffix).name}",
         )  # fmt: skip
     if pieces is not None and form != "crazyswarm" and pieces > 31:
         raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
+    if is_fleet and output.exists() and not output.is_dir():
+        raise InputError("this is a file", where=str(output), hint="name a folder; it need not exist yet")
     if output.exists() and not force:
-        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
+        what = "folder" if is_fleet else "file"
+        raise InputError(f"the {what} already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")

@@ -1,6 +1,7 @@
-"""Commands on a fleet file: plan, check and rehearse all vehicles together."""
+"""Commands on a fleet file: plan, check, rehearse and export all vehicles together."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,6 +74,62 @@ def rehearse_and_print(file: Path, safety_file: Path | None, planning: dict[str,
         print_table("Dry runs", ["vehicle", "verdict", "largest deviation"], rows)
 
 
+@dataclass(frozen=True, slots=True)
+class ExportSettings:
+    """The form of an export, and where it is written."""
+
+    form: str
+    output: Path  # the folder
+    leads: bool
+    pieces: int | None  # at most, of polynomials
+    rate: float  # Hz, of samples
+
+
+def export_and_print(
+    file: Path, safety_file: Path | None, planning: dict[str, Any], settings: ExportSettings, steps: Steps
+) -> None:
+    """Plan a fleet, write a file per vehicle, and print when each begins and how near each pair comes."""
+    limits, flight = options.read_limits(safety_file, file, steps), options.flight_options(planning, safety_file, file)
+    with steps.waiting("loading planners"):
+        from cfplan.preparation import export_fleet, export_flight
+
+    form, folder = export_flight.Form(settings.form), settings.output
+    fleet = export_fleet.plan_fleet_to_export(file, limits, flight, steps, form=form)
+    if form is not export_flight.Form.SAMPLES:
+        most = settings.pieces or export_flight.MOST_PIECES
+        fit = export_fleet.export_fit(form, leads=settings.leads, most=most)
+        fitted = export_fleet.fit_fleet(fleet, fit, steps)
+        fleet, polynomials = fitted.fleet, fitted.waiting
+    documents = []
+    with steps.step("save") as results:
+        _make_folder(folder)
+        for number, member in enumerate(fleet.members):
+            written = folder / f"{member.name}{form.suffix}"
+            if form is export_flight.Form.SAMPLES:
+                count = export_flight.write_samples(fleet.flights[number], settings.rate, written, member.delay)
+                documents.append({"file": str(written), "samples": count})
+            else:
+                export_flight.write_polynomials(polynomials[number], form, written)
+                documents.append({"file": str(written)} | polynomials[number].to_dict())
+            results.append(str(written))
+    if steps.as_json:
+        document = fleet.to_dict()
+        vehicles = [each | {"export": more} for each, more in zip(document["vehicles"], documents, strict=True)]
+        print_json(document | {"vehicles": vehicles})
+    else:
+        _print_tables(fleet)
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"the folder cannot be made ({error.strerror or error})", where=str(folder),
+            hint="name a folder in one that can be written",
+        ) from error  # fmt: skip
+
+
 def _planned(file: Path, safety_file: Path | None, planning: dict[str, Any], steps: Steps) -> "PlannedFleet":
     limits = options.read_limits(safety_file, file, steps)
     with steps.waiting("loading planners"):
@@ -84,6 +141,8 @@ def _planned(file: Path, safety_file: Path | None, planning: dict[str, Any], ste
 def _print_tables(fleet: "PlannedFleet") -> None:
     print_table("Vehicles", ["vehicle", "starts", "ends", "slower"], fleet.vehicle_rows())
     print_table("Separation: passed", ["pair", "nearest", "allowed", "at", "where, m"], fleet.pair_rows())
+    if not fleet.losses:
+        return
     verdict = "passed" if fleet.losses[0].keeps(fleet.lost_keep) else "not passed"
     columns = ["lost", "nearest pair", "distance", "allowed", "lost at", "where, m", "then", "nearer for"]
     print_table(f"Lost vehicles: {verdict}", columns, fleet.loss_rows())

@@ -23,6 +23,7 @@ from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
 from cfplan.numbers import shown
 from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import INSTANT
 from cfplan.safety.space import inside
@@ -89,11 +90,16 @@ def plan_for_polynomials(
     """
     if source.suffix == PLAN_SUFFIX and options.correction is None:
         return plan_flight(source, limits, options, on_step)
-    gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
-    streamed_loss = replace(limits.link_loss, only_warn=True)  # there is no stream
-    planned = plan_flight(source, replace(limits, plan=gentle, link_loss=streamed_loss), options, on_step)
+    planned = plan_flight(source, limits_for_polynomials(limits), options, on_step)
     uncorrected = planned.uncorrected and replace(planned.uncorrected, limits=limits)
     return replace(planned, limits=limits, uncorrected=uncorrected)
+
+
+def limits_for_polynomials(limits: Limits) -> Limits:
+    """Return the limits for a plan to which polynomials are fitted: less angular acceleration, which they exceed."""
+    gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
+    streamed_loss = replace(limits.link_loss, only_warn=True)  # there is no stream
+    return replace(limits, plan=gentle, link_loss=streamed_loss)
 
 
 def fit_polynomials(
@@ -179,6 +185,17 @@ def _describe(made: OnBoardTrajectory, planned: PlannedFlight) -> str:
     )
 
 
+def slowed(planned: PlannedFlight, slowing: float) -> PlannedFlight:
+    """Return the flight with a plan that takes `slowing` times as long, certified again for polynomials."""
+    plan, limits = planned.plan, planned.limits
+    if slowing != 1.0:
+        trajectory = Trajectory(plan.path, plan.profile.slowed(1.0 / slowing), plan.airframe)
+        certificate = certify(trajectory, limits.plan, limits.space, plan.slowing.caps if plan.slowing else None)
+        notes = (*plan.notes, f"slowed by {100 * (slowing - 1.0):.1f} % for polynomials")
+        plan = replace(plan, trajectory=trajectory, certificate=certificate, notes=notes)
+    return replace(planned, plan=replace(plan, limits=limits))
+
+
 def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
     """Write polynomials, and read them back like their receiver. Raises InputError or NotCertifiedError."""
     pieces = exported.on_board.pieces
@@ -193,10 +210,11 @@ def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
         raise NotCertifiedError("the written file reads back differently", where=str(file), hint="please report this")
 
 
-def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
+def write_samples(planned: PlannedFlight, rate: float, file: Path, wait: float = 0.0) -> int:
     """Write a plan's states at `rate`, Hz, including its end, and check the file; return the number of samples.
 
-    Raises InputError, or NotCertifiedError if the plan's certificate or a sample exceeds a limit.
+    Before its plan the vehicle hovers at the start for `wait`, s. Raises InputError, or NotCertifiedError if the plan's
+    certificate or a sample exceeds a limit.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
     worst = planned.certificate.worst
@@ -205,18 +223,19 @@ def write_samples(planned: PlannedFlight, rate: float, file: Path) -> int:
             f"{worst.name} reaches {100 * worst.share:.1f} % of its limit at {worst.time:.2f} s",
             where=planned.name, hint="plan the path again under this safety.yaml",
         )  # fmt: skip
-    rows = sample_rows(trajectory, rate)
+    rows = sample_rows(trajectory, rate, wait)
     lines = [",".join(f"{value:.{_DIGITS}f}" for value in row) for row in rows.tolist()]
     write_atomically(file, ("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
     read, _ = read_table(file, len(COLUMNS), ", ".join(COLUMNS))
-    check_samples(read, trajectory, limits, str(file))
+    check_samples(read, trajectory, limits, str(file), wait)
     return len(read)
 
 
-def sample_rows(trajectory: Trajectory, rate: float) -> NDArray:
+def sample_rows(trajectory: Trajectory, rate: float, wait: float = 0.0) -> NDArray:
     """Return (N, 18): the columns of a file of samples, SI units and rad, the quaternion body to world."""
-    times = np.append(np.arange(np.ceil(trajectory.duration * rate)) / rate, trajectory.duration)
-    state = trajectory.at(times)
+    end = wait + trajectory.duration
+    times = np.append(np.arange(np.ceil(end * rate)) / rate, end)
+    state = trajectory.at(times - wait)
     return np.column_stack(
         [
             times, state.position, state.velocity, state.acceleration, state.yaw, state.body_rate, state.quaternion,
@@ -224,12 +243,12 @@ def sample_rows(trajectory: Trajectory, rate: float) -> NDArray:
     )  # fmt: skip
 
 
-def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: str) -> None:
-    """Check that samples, (N, 18), agree with a trajectory and keep the limits, up to rounding.
+def check_samples(rows: NDArray, trajectory: Trajectory, limits: Limits, where: str, wait: float = 0.0) -> None:
+    """Check that samples, (N, 18), agree with a trajectory after `wait`, s, and keep the limits, up to rounding.
 
     Raises NotCertifiedError with the line.
     """
-    state = trajectory.at(rows[:, 0])
+    state = trajectory.at(rows[:, 0] - wait)
     expected = [
         state.position, state.velocity, state.acceleration, state.yaw, state.body_rate, state.quaternion,
     ]  # fmt: skip

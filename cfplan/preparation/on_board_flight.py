@@ -27,11 +27,10 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_motion, encode_t
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials
+from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials, slowed
 from cfplan.preparation.local_slowing import Assessment, slow_locally
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
-from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
 from cfplan.safety.quantities import QUANTITIES
 from cfplan.safety.space import inside
@@ -92,13 +91,13 @@ def prepare_on_board_flight(
             where="landing", hint="lower `ground.land_speed` in safety.yaml",
         )  # fmt: skip
     lost, falls = _require_harmless_fall(made, limits, exported.dry_run.deviation, on_step)
-    slowed = _as_slow(planned, made)
-    mission = _mission(slowed.plan, limits, made, on_step)
+    slowed_flight = slowed(planned, made.reference.slowing)
+    mission = _mission(slowed_flight.plan, limits, made, on_step)
     program = OnBoardProgram(
         memory, made.compressed, len(whole.durations), _place(whole), _descent(whole, made, limits), falls,
         exported.dry_run.deviation,
     )  # fmt: skip
-    return PreparedOnBoard(slowed, exported.dry_run, lost, replace(mission, on_board=program))
+    return PreparedOnBoard(slowed_flight, exported.dry_run, lost, replace(mission, on_board=program))
 
 
 def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
@@ -125,9 +124,9 @@ def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
         ]
 
     with step(on_step, "slowing for the fall") as results:
-        slowed, _ = slow_locally(planned.plan, assess)
-        results.append(slowed.describe_slowing() or "not needed")
-    return replace(planned, plan=slowed)
+        slower, _ = slow_locally(planned.plan, assess)
+        results.append(slower.describe_slowing() or "not needed")
+    return replace(planned, plan=slower)
 
 
 def _require_harmless_fall(
@@ -152,17 +151,6 @@ def _require_harmless_fall(
                 hint=_FALL_HINT,
             )
     return lost, where
-
-
-def _as_slow(planned: PlannedFlight, made: OnBoardTrajectory) -> PlannedFlight:
-    """Return the plan slowed like its polynomials, certified again."""
-    plan, limits, slowing = planned.plan, planned.limits, made.reference.slowing
-    if slowing != 1.0:
-        trajectory = Trajectory(plan.path, plan.profile.slowed(1.0 / slowing), plan.airframe)
-        certificate = certify(trajectory, limits.plan, limits.space, plan.slowing.caps if plan.slowing else None)
-        notes = (*plan.notes, f"slowed by {100 * (slowing - 1.0):.1f} % for polynomials")
-        plan = replace(plan, trajectory=trajectory, certificate=certificate, notes=notes)
-    return replace(planned, plan=replace(plan, limits=limits))
 
 
 def _mission(plan: Plan, limits: Limits, made: OnBoardTrajectory, on_step: OnStep) -> Mission:

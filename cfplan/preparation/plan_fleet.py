@@ -47,7 +47,7 @@ class PlannedFleet:
     skew: float  # s
     members: tuple[FleetMember, ...]
     separations: tuple[Separation, ...]  # of every pair, the nearest first
-    losses: tuple[Loss, ...]  # of every vehicle and every shared dongle, the nearest first
+    losses: tuple[Loss, ...]  # of every vehicle and every shared dongle, the nearest first; none if not regarded
     alone: float  # s, the longest plan before coordination
     limits: Limits
 
@@ -130,9 +130,23 @@ def plan_fleet(
         InfeasibleError: a path has no certified plan, or no start delays and clock rates were found.
         NotCertifiedError: a pair comes too near.
     """
+    fleet = load_fleet(source, on_step)
+    alone = plan_alone(fleet, limits, options, on_step)
+    return coordinate_fleet(fleet, alone, limits, loss_model(fleet, limits), on_step)
+
+
+def load_fleet(source: Path | FleetFile, on_step: OnStep = ignore_steps) -> FleetFile:
+    """Return the fleet of a file, or the one given. Raises InputError."""
     with step(on_step, "fleet") as results:
         fleet = source if isinstance(source, FleetFile) else load_fleet_file(source)
         results.append(f"{fleet.name}, {len(fleet.vehicles)} vehicles, {fleet.apart:g} m apart")
+    return fleet
+
+
+def plan_alone(
+    fleet: FleetFile, limits: Limits, options: FlightOptions | None = None, on_step: OnStep = ignore_steps
+) -> list[FleetMember]:
+    """Plan the path of each vehicle without regard to the others. Raises InfeasibleError with the vehicle's name."""
     alone = []
     for vehicle in fleet.vehicles:
         with step(on_step, vehicle.name) as results:
@@ -144,22 +158,26 @@ def plan_fleet(
             if plan.slowing:
                 results.append(plan.describe_slowing())
         alone.append(FleetMember(vehicle.name, plan))
-    return coordinate_fleet(fleet, alone, limits, on_step)
+    return alone
 
 
 def coordinate_fleet(
-    fleet: FleetFile, alone: Sequence[FleetMember], limits: Limits, on_step: OnStep = ignore_steps
+    fleet: FleetFile,
+    alone: Sequence[FleetMember],
+    limits: Limits,
+    model: LossModel | None,
+    on_step: OnStep = ignore_steps,
 ) -> PlannedFleet:
     """Coordinate certified plans; certify every pair, and every vehicle and dongle that may be lost.
 
-    Raises InfeasibleError and NotCertifiedError as plan_fleet().
+    Without a model of lost vehicles, these are not regarded. Raises InfeasibleError and NotCertifiedError as
+    plan_fleet().
     """
     longest = max(member.plan.trajectory.duration for member in alone)
-    model = loss_model(fleet, limits)
     with step(on_step, "coordination") as results:
         members = coordinate(alone, fleet.apart, fleet.skew, _given_way, model)
         avoids_lost = not isinstance(members, Blocked)
-        if isinstance(members, Blocked):
+        if isinstance(members, Blocked) and model is not None:
             members = coordinate(alone, fleet.apart, fleet.skew, _given_way)
         if isinstance(members, Blocked):
             raise InfeasibleError(
@@ -182,6 +200,17 @@ def coordinate_fleet(
                     where=fleet.name,
                     hint="plan the fleet again, or move a path",
                 )
+    losses: tuple[Loss, ...] = ()
+    if model is not None:
+        losses = _certified_losses(fleet, members, model, avoids_lost, on_step)
+        _warn_of_walls(members, limits, on_step)
+    return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
+
+
+def _certified_losses(
+    fleet: FleetFile, members: Sequence[FleetMember], model: LossModel, avoids_lost: bool, on_step: OnStep
+) -> tuple[Loss, ...]:
+    """Return the worst moments to lose a vehicle. Raises InfeasibleError if they do not pass, unless it only warns."""
     with step(on_step, "lost vehicles") as results:
         losses = model.losses(members, range(len(members)), fleet.skew)
         (results.append if avoids_lost else results.warn)(str(losses[0]))
@@ -191,8 +220,12 @@ def coordinate_fleet(
                 where=fleet.name,
                 hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each vehicle its own dongle, {_LOST_HINT}",
             )
-    _warn_of_walls(members, limits, on_step)
-    return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
+    return losses
+
+
+def steps_of(name: str, on_step: OnStep) -> OnStep:
+    """Return a listener to the steps of one vehicle, which puts its name before each."""
+    return lambda step, state, result: on_step(f"{name}: {step}", state, result)
 
 
 def drift_without_poses(limits: Limits) -> float:
@@ -262,7 +295,7 @@ def rehearse_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> dict[
             results.append(f"{len(encoded.payloads)} setpoints, deviation {dry_runs[flight.name].expected()}")
             lost = find_link_loss(encoded, fleet.limits)
             (results.append if inside(lost.beyond) else results.warn)(str(lost))
-    _require_allowed_deviation(fleet, dry_runs, on_step)
+    require_allowed_deviation(fleet, dry_runs, on_step)
     return dry_runs
 
 
@@ -278,11 +311,11 @@ def prepare_fleet(fleet: PlannedFleet, on_step: OnStep = ignore_steps) -> tuple[
             results.append(f"{len(encoded.payloads)} setpoints, deviation {rehearsed.expected()}, a stop from each")
             (results.append if inside(lost.beyond) else results.warn)(str(lost))
         prepared.append(PreparedFlight(flight, encoded, rehearsed, lost, stops, mission))
-    _require_allowed_deviation(fleet, {each.planned.name: each.dry_run for each in prepared}, on_step)
+    require_allowed_deviation(fleet, {each.planned.name: each.dry_run for each in prepared}, on_step)
     return tuple(prepared)
 
 
-def _require_allowed_deviation(fleet: PlannedFleet, dry_runs: Mapping[str, DryRun], on_step: OnStep) -> None:
+def require_allowed_deviation(fleet: PlannedFleet, dry_runs: Mapping[str, DryRun], on_step: OnStep) -> None:
     """Raise NotCertifiedError if a vehicle deviates in its dry run by more than `apart` leaves room for."""
     allowed = allowed_deviation(fleet.apart)
     with step(on_step, "deviation") as results:

@@ -11,6 +11,7 @@ from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
 from cfplan.flight.radio.crazyradio import find_radios
 from cfplan.flight.radio.uri import check_vehicle_uri
 from cfplan.planning.fleet.fleet_file import FleetFile
+from cfplan.preparation.plan_fleet import steps_of
 from cfplan.preparation.steps import OnStep, step
 from cfplan.safety.limits import PoseLimits
 from cfplan.steering.starting_vehicle import SIMULATED, look_at_hardware
@@ -72,16 +73,11 @@ def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, o
     """
     for name, address in addresses.items():
         if not address.virtual:
-            look_at_hardware(address.uri, address.mocap, limits, _named(name, on_step))
+            look_at_hardware(address.uri, address.mocap, limits, steps_of(name, on_step))
     for dongle in dict.fromkeys(address.dongle for address in addresses.values() if address.dongle):
         with step(on_step, f"dongle {dongle}") as results:
             sharing = [name for name, address in addresses.items() if address.dongle == dongle]
             results.append(require_capacity(dongle, sharing, dongle_mode(find_radios()[int(dongle)].bcdDevice)))
-
-
-def _named(name: str, on_step: OnStep) -> OnStep:
-    """Return a listener to steps that puts the vehicle's name before each."""
-    return lambda step, state, result: on_step(f"{name}: {step}", state, result)
 
 
 def _require_all_virtual_or_none(fleet: FleetFile, mocap: str | None) -> None:

@@ -43,7 +43,7 @@ RECORD = re.compile(r"records/[\w<>-]+")
 ON_HARDWARE = (("radio://0/80/2M/E7E7E7E7E7", "sim://0"), ("vicon://192.168.1.2/cf1", "vicon://lab/cf1"))
 SLOW = (
     "/scan.yaml", "/circle.yaml --to", "--gif", "--png", "replay records/20261122-212927-figure-eight --figure",
-    "--on-board", "fly flights/identify.yaml", "--warm-up", "/six.yaml",
+    "--on-board", "fly flights/identify.yaml", "--warm-up", "/six.yaml", "export flights/fleets",
 )  # fmt: skip
 DRIVERS = [*Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"), *Path("/etc/vulkan/icd.d").glob("lvp_icd*.json")]
 no_driver = pytest.mark.skipif(not DRIVERS, reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")

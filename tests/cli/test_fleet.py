@@ -1,6 +1,12 @@
-"""Commands on fleet files: planned and checked together; what flies or saves one plan refuses them in words."""
+"""Commands on fleet files: planned, checked and exported together; what is of one plan refuses them in words."""
 
+from pathlib import Path
+
+import numpy as np
 import pytest
+
+from cfplan.flight.on_board.memory_format import read_compressed, read_raw
+from cfplan.flight.on_board.pieces import states_at
 
 LINES = "vehicles:\n  a: {path: line.yaml}\n  b: {path: line.yaml, place: {yaw_deg: 90}}\n"
 
@@ -12,6 +18,29 @@ def fleet_file(tmp_path):
     file = tmp_path / "fleet.yaml"
     file.write_text(LINES)
     return file
+
+
+@pytest.fixture
+def export(cfplan, fleet_file, safety_file, tmp_path):
+    """Write the fleet in a form; return what was printed as JSON, and the folder."""
+
+    def run(form, *words):
+        folder = tmp_path / form
+        ended = cfplan("export", fleet_file, "--safety", safety_file(), "--to", form, "-o", folder, "--json", *words)
+        assert ended.code == 0, ended.err
+        return ended.json, folder
+
+    return run
+
+
+def places_of_crazyswarm(file, times):
+    """Return x and y at each time, as Crazyswarm flies a file that it was told to start at 0; (N, 2) m."""
+    table = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
+    begins = np.concatenate([[0.0], np.cumsum(table[:, 0])])
+    rows = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(table) - 1)
+    own = np.minimum(times - begins[rows], table[rows, 0])
+    powers = own[:, None] ** np.arange(8)
+    return np.stack([(table[rows, k : k + 8] * powers).sum(axis=1) for k in (1, 9)], axis=1)
 
 
 @pytest.fixture
@@ -91,13 +120,64 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     assert "Dry runs" in ended.out
 
 
+@pytest.mark.parametrize("form", ["crazyswarm", "memory", "compressed"])
+def test_polynomials_of_a_fleet_that_are_started_together_keep_apart(export, form):
+    document, folder = export(form)
+    times = np.arange(0.0, 2.0 * document["duration"], 0.01)
+    flown = []
+    for vehicle in document["vehicles"]:
+        written = vehicle["export"]
+        assert written["file"] == str(folder / vehicle["name"]) + (".csv" if form == "crazyswarm" else ".bin")
+        assert written["certificate"]["passed"]
+        assert written["compressed"] == (form == "compressed")
+        assert written["duration"] > vehicle["ends"]
+        if form == "crazyswarm":
+            flown.append(places_of_crazyswarm(written["file"], times))
+            continue
+        memory = Path(written["file"]).read_bytes()
+        pieces = read_compressed(memory) if form == "compressed" else read_raw(memory, written["pieces"])
+        flown.append(states_at(pieces, np.minimum(times, pieces.duration))[:, 0, :2])
+    ends = np.array([[-1.0, 0.0], [0.0, -1.0]])
+    for places, end in zip(flown, ends, strict=True):
+        np.testing.assert_allclose(places[[0, -1]], [end, -end], atol=2e-3)
+    # They lead the plan, by some cm where it is fast, and stray 2 cm at most.
+    assert np.linalg.norm(flown[0] - flown[1], axis=1).min() > document["apart"] - 0.05
+    assert min(vehicle["starts"] for vehicle in document["vehicles"]) == 0.0
+    assert document["pairs"][0]["distance"] >= document["apart"]
+    assert document["lost"] == []
+
+
+def test_samples_of_a_fleet_begin_at_one_time_and_keep_apart(export):
+    document, folder = export("samples", "--rate", "50")
+    a, b = (np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in ("a", "b"))
+    assert a[0, 0] == b[0, 0] == 0.0
+    many = min(len(a), len(b)) - 1
+    np.testing.assert_allclose(a[:many, 0], b[:many, 0], atol=1e-9)
+    assert np.linalg.norm(a[:many, 1:3] - b[:many, 1:3], axis=1).min() >= document["apart"]
+    later = max(document["vehicles"], key=lambda each: each["starts"])
+    waits = {"a": a, "b": b}[later["name"]]
+    waits = waits[waits[:, 0] < later["starts"]]
+    assert len(waits) == pytest.approx(50 * later["starts"], abs=1)
+    assert not waits[:, 4:10].any()
+
+
+def test_no_folder_is_made_for_a_fleet_that_is_refused(cfplan, narrow_fleet, safety_file, tmp_path):
+    file = narrow_fleet()
+    file.write_text(file.read_text().replace("y: 0.35", "y: 0.2"))
+    ended = cfplan("export", file, "--safety", safety_file(), "--to", "samples", "-o", tmp_path / "out")
+    assert ended.code == 2
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("command", "words", "what"),
     [
         ("plan", ["-o", "a.parquet"], "plan files are not supported"),
         ("fly", ["--records", ".", "--on-board"], "do not fly with --on-board"),
         ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "do not fly with --uri"),
-        ("export", ["--to", "samples", "-o", "out.csv"], "a fleet file"),
+        ("export", ["--to", "samples", "-o", "out.csv"], "a folder with a file per vehicle"),
+        ("export", ["--to", "memory", "-o", "line.yaml"], "this is a file"),
+        ("export", ["--to", "memory", "-o", "."], "the folder already exists"),
     ],
 )
 def test_what_is_of_one_vehicle_refuses_a_fleet(

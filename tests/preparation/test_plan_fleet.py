@@ -11,7 +11,7 @@ from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import CLEAR, separations
 from cfplan.planning.plan import plan
-from cfplan.preparation.plan_fleet import PlannedFleet, coordinate_fleet, prepare_fleet, rehearse_fleet
+from cfplan.preparation.plan_fleet import PlannedFleet, coordinate_fleet, loss_model, prepare_fleet, rehearse_fleet
 from cfplan.preparation.plan_flight import PlannedFlight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.preparation.steps import StepState
@@ -70,8 +70,9 @@ def test_a_path_nearer_to_a_wall_than_a_vehicle_without_poses_drifts_is_warned_o
     """In 2 s it drifts 0.34 m by 1° of attitude error, and 0.2 m or 0.1 m by the error of its velocity."""
     steps = {}
     precise = replace(limits, link_loss=replace(limits.link_loss, velocity_error=velocity_error))
+    fleet = FleetFile("beside a wall", (), 0.35, SKEW)
     coordinate_fleet(
-        FleetFile("beside a wall", (), 0.35, SKEW), beside_a_wall, precise,
+        fleet, beside_a_wall, precise, loss_model(fleet, precise),
         lambda name, state, result: steps.update({name: (state, result)}),
     )  # fmt: skip
     state, result = steps["walls"]
