@@ -30,17 +30,18 @@ def fly_fleet(
     planning: dict[str, Any],
     steps: Steps,
     *,
+    on_board: bool,
     yes: bool,
 ) -> int:
     """Fly a fleet; return its exit code. Raises a CfplanError where nothing flies."""
     fleet_file = load_fleet_file(file)
-    addresses = fleet_addresses(fleet_file, mocap)
+    addresses = fleet_addresses(fleet_file, mocap, on_board=on_board)
     limits = options.read_limits(safety_file, file, steps, compiled=True)
-    look_at_fleet(addresses, limits.pose, steps)
+    look_at_fleet(addresses, limits.pose, steps, on_board=on_board)
     choices = options.flight_options(planning, safety_file, file)
     shown = _Shown(steps)
     with ConnectedFleet(
-        fleet_file, addresses, limits, choices, records=records, on_step=steps, listen=shown.show
+        fleet_file, addresses, limits, choices, on_board=on_board, records=records, on_step=steps, listen=shown.show
     ) as fleet:
         prepared = {each.address.uri: each.prepared for each in fleet.vehicles}
         if not confirmed(prepared, fleet.plan.name, records, yes=yes, speed_factor=planning["speed_factor"]):

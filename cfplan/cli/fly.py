@@ -101,7 +101,7 @@ def fly(
     steps, watched = Steps(as_json=as_json), Watched(live, mavlink)
     options.check_place(uri, safety_file, records)
     if path_or_plan is not None and lines is None and fleet.is_fleet(path_or_plan):
-        return _fly_fleet(path_or_plan, safety_file, mocap_uri, records, planning, steps, yes=yes)
+        return _fly_fleet(path_or_plan, safety_file, mocap_uri, records, planning, steps, on_board=on_board, yes=yes)
     check_uris(uri, mocap_uri)
     check_watchers(watched)
     if path_or_plan is None or lines is not None:
@@ -123,18 +123,18 @@ def fly(
 
 def _fly_fleet(
     file: Path, safety_file: Path | None, mocap: str | None, records: Path, planning: dict[str, Any], steps: Steps,
-    *, yes: bool,
+    *, on_board: bool, yes: bool,
 ) -> int:  # fmt: skip
     """Fly a fleet file. Raises InputError for options that a fleet does not have."""
     context = click.get_current_context()
     given = {
         f"--{name.replace('_', '-')}": context.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        for name in ("uri", "on_board", "after", "live", "mavlink")
+        for name in ("uri", "after", "live", "mavlink")
     }
     fleet.refuse_flight_options(given)
     with steps.waiting("loading planners and simulator"):
         from cfplan.cli.fleet_flight import fly_fleet
-    return fly_fleet(file, safety_file, mocap, records, planning, steps, yes=yes)
+    return fly_fleet(file, safety_file, mocap, records, planning, steps, on_board=on_board, yes=yes)
 
 
 def _preparation(

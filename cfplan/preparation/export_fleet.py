@@ -14,10 +14,10 @@ from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.wait import WAIT_SIZE, WAIT_STEP, with_wait
 from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
-from cfplan.planning.fleet.separation import separations
 from cfplan.preparation.export_flight import ExportedFlight, Form, fit_polynomials, limits_for_polynomials, slowed
 from cfplan.preparation.plan_fleet import (
     PlannedFleet,
+    certify_separation,
     coordinate_fleet,
     load_fleet,
     plan_alone,
@@ -25,7 +25,7 @@ from cfplan.preparation.plan_fleet import (
     steps_of,
 )
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
-from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.preparation.steps import OnStep, ignore_steps
 from cfplan.safety.limits import Limits
 
 _ATTEMPTS = 5  # to slow all together
@@ -72,13 +72,7 @@ def fit_fleet(fleet: PlannedFleet, fit: Fit, on_step: OnStep = ignore_steps) -> 
     Raises NotCertifiedError if a fit does, if all cannot be slowed together, or if a pair comes too near.
     """
     slower, exported = _fitted_together(fleet, fit, on_step)
-    found = separations(slower.members, fleet.skew)
-    with step(on_step, "separation") as results:
-        results.append(f"nearest {found[0]}")
-        if not found[0].keeps(fleet.apart):
-            raise NotCertifiedError(
-                f"{found[0]}; they must keep {fleet.apart:g} m", where=fleet.name, hint="plan the fleet again"
-            )
+    found = certify_separation(slower, slower.members, None, on_step)
     slower = replace(slower, separations=found)
     require_allowed_deviation(
         slower, {member.name: each.dry_run for member, each in zip(slower.members, exported, strict=True)}, on_step

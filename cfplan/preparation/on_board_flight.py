@@ -27,7 +27,7 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_motion, encode_t
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials, slowed
+from cfplan.preparation.export_flight import ExportedFlight, Form, fit_polynomials, plan_for_polynomials, slowed
 from cfplan.preparation.local_slowing import Assessment, slow_locally
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
@@ -71,18 +71,35 @@ def prepare_on_board_flight(
         InfeasibleError: the path leaves the space, or no profile keeps the limits.
         NotCertifiedError: the certificate, the dry run, a stop, or the fall after link loss does not pass.
     """
+    require_watchdog(limits)
+    planned = plan_for_polynomials(source, limits, options or FlightOptions(), on_step)
+    if not planned.was_read and not limits.link_loss.only_warn:
+        planned = give_way_to_fall(planned, on_step)
+    return with_program(planned, fit_for_program(planned, on_step), on_step)
+
+
+def require_watchdog(limits: Limits) -> None:
+    """Raise InputError unless the watchdog is on."""
     if not limits.firmware.watchdog:
         raise InputError(
             "the vehicle has no time-out for what it flies on board, and its watchdog is off",
             where="firmware.watchdog",
             hint="set it to true in safety.yaml: it stops the motors a second after the link died",
         )
-    planned = plan_for_polynomials(source, limits, options or FlightOptions(), on_step)
-    if not planned.was_read and not limits.link_loss.only_warn:
-        planned = _give_way(planned, on_step)
+
+
+def fit_for_program(planned: PlannedFlight, on_step: OnStep = ignore_steps) -> ExportedFlight:
+    """Fit polynomials that leave room for the landing. Raises NotCertifiedError as fit_polynomials()."""
     pieces, room = MOST_PIECES - LANDING_PIECES, MEMORY_SIZE - LANDING_SIZE
-    exported = fit_polynomials(planned, Form.MEMORY, most=pieces, room=room, on_step=on_step)
-    made = exported.on_board
+    return fit_polynomials(planned, Form.MEMORY, most=pieces, room=room, on_step=on_step)
+
+
+def with_program(planned: PlannedFlight, exported: ExportedFlight, on_step: OnStep = ignore_steps) -> PreparedOnBoard:
+    """Return the mission of polynomials that were fitted to a plan, with the landing at their end.
+
+    Raises NotCertifiedError if the landing, a stop, or the fall after link loss does not pass.
+    """
+    made, limits = exported.on_board, planned.limits
     memory, whole = with_landing(made, limits.space.low[2], limits.ground.land_speed)
     certificate = certify_pieces(whole, limits.airframe, limits.plan)
     if not certificate.passed:
@@ -91,16 +108,16 @@ def prepare_on_board_flight(
             where="landing", hint="lower `ground.land_speed` in safety.yaml",
         )  # fmt: skip
     lost, falls = _require_harmless_fall(made, limits, exported.dry_run.deviation, on_step)
-    slowed_flight = slowed(planned, made.reference.slowing)
-    mission = _mission(slowed_flight.plan, limits, made, on_step)
+    flown = slowed(planned, made.reference.slowing)
+    mission = _mission(flown.plan, limits, made, on_step)
     program = OnBoardProgram(
         memory, made.compressed, len(whole.durations), _place(whole), _descent(whole, made, limits), falls,
         exported.dry_run.deviation,
     )  # fmt: skip
-    return PreparedOnBoard(slowed_flight, exported.dry_run, lost, replace(mission, on_board=program))
+    return PreparedOnBoard(flown, exported.dry_run, lost, replace(mission, on_board=program))
 
 
-def _give_way(planned: PlannedFlight, on_step: OnStep) -> PlannedFlight:
+def give_way_to_fall(planned: PlannedFlight, on_step: OnStep = ignore_steps) -> PlannedFlight:
     """Return the plan, slower where the vehicle would fall beyond the walls. Raises InfeasibleError if none helps."""
 
     space = planned.limits.space

@@ -4,10 +4,10 @@ fleet file → each vehicle's plan → start delays and clock rates → the cert
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,11 +15,11 @@ from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.flight.firmware import estimate_errors
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.stops import stop_clock
-from cfplan.planning.fleet.coordination import Blocked, coordinate
+from cfplan.planning.fleet.coordination import Blocked, Finish, coordinate
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
 from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
-from cfplan.planning.fleet.separation import CLEAR, Separation, allowed_deviation, separations
+from cfplan.planning.fleet.separation import CLEAR, Separation, Stops, allowed_deviation, separations, stop_separations
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
@@ -31,6 +31,7 @@ from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 from cfplan.vehicle.airframe import GRAVITY
 
+Made = TypeVar("Made")
 _TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
 _BLIND = 2.0  # s, about, in which a vehicle without poses brakes and comes down; after 3 s its motors stop
 _CEILING = FLOOR + 3  # its number among the faces
@@ -167,18 +168,19 @@ def coordinate_fleet(
     limits: Limits,
     model: LossModel | None,
     on_step: OnStep = ignore_steps,
+    finish: Finish | None = None,
 ) -> PlannedFleet:
     """Coordinate certified plans; certify every pair, and every vehicle and dongle that may be lost.
 
-    Without a model of lost vehicles, these are not regarded. Raises InfeasibleError and NotCertifiedError as
-    plan_fleet().
+    `finish` finishes plans that were made again; by default they give way as streamed ones do. Without a model of lost
+    vehicles, these are not regarded. Raises InfeasibleError and NotCertifiedError as plan_fleet().
     """
+    finish, stops = finish or _given_way, None if model is None else model.stops
     longest = max(member.plan.trajectory.duration for member in alone)
     with step(on_step, "coordination") as results:
-        members = coordinate(alone, fleet.apart, fleet.skew, _given_way, model)
-        avoids_lost = not isinstance(members, Blocked)
+        members = coordinate(alone, fleet.apart, fleet.skew, finish, model, stops)
         if isinstance(members, Blocked) and model is not None:
-            members = coordinate(alone, fleet.apart, fleet.skew, _given_way)
+            members = coordinate(alone, fleet.apart, fleet.skew, finish, stops=stops)
         if isinstance(members, Blocked):
             raise InfeasibleError(
                 f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {members}",
@@ -190,29 +192,47 @@ def coordinate_fleet(
         end = max(member.end for member in members)
         results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
         results.append(f"waiting at the start: {waiting}, slowed: {slower}")
-    with step(on_step, "separation") as results:
-        found = separations(members, fleet.skew)
-        results.append(f"nearest {found[0]}")
-        for each in found:
-            if not each.keeps(fleet.apart):
-                raise NotCertifiedError(
-                    f"{each}; they must keep {fleet.apart:g} m",
-                    where=fleet.name,
-                    hint="plan the fleet again, or move a path",
-                )
+    found = certify_separation(fleet, members, stops, on_step)
     losses: tuple[Loss, ...] = ()
     if model is not None:
-        losses = _certified_losses(fleet, members, model, avoids_lost, on_step)
+        losses = certify_losses(fleet, members, model, on_step)
         _warn_of_walls(members, limits, on_step)
     return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
 
 
-def _certified_losses(
-    fleet: FleetFile, members: Sequence[FleetMember], model: LossModel, avoids_lost: bool, on_step: OnStep
+def certify_separation(
+    fleet: FleetFile | PlannedFleet,
+    members: Sequence[FleetMember],
+    stops: Callable[[Plan], Stops] | None,
+    on_step: OnStep = ignore_steps,
+) -> tuple[Separation, ...]:
+    """Return how near each pair comes, the nearest first, also when all leave their paths to stop.
+
+    Raises NotCertifiedError if a pair comes too near.
+    """
+    with step(on_step, "separation") as results:
+        found = separations(members, fleet.skew)
+        if stops is not None:
+            braked = stop_separations(members, [stops(member.plan) for member in members], fleet.skew)
+            both = sorted((*found, *braked), key=lambda each: each.distance)
+            found = tuple({each.pair: each for each in reversed(both)}.values())[::-1]
+        results.append(f"nearest {found[0]}")
+        if not found[0].keeps(fleet.apart):
+            raise NotCertifiedError(
+                f"{found[0]}; they must keep {fleet.apart:g} m",
+                where=fleet.name,
+                hint="plan the fleet again, or move a path",
+            )
+    return found
+
+
+def certify_losses(
+    fleet: FleetFile, members: Sequence[FleetMember], model: LossModel, on_step: OnStep = ignore_steps
 ) -> tuple[Loss, ...]:
     """Return the worst moments to lose a vehicle. Raises InfeasibleError if they do not pass, unless it only warns."""
     with step(on_step, "lost vehicles") as results:
         losses = model.losses(members, range(len(members)), fleet.skew)
+        avoids_lost = losses[0].keeps(model.clearance)
         (results.append if avoids_lost else results.warn)(str(losses[0]))
         if not avoids_lost and not fleet.lost_only_warns:
             raise InfeasibleError(
@@ -264,17 +284,25 @@ def lost_clearance(apart: float) -> float:
 
 def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
     """Return where the vehicles of a fleet go when they are lost, and how they stop."""
-    tubes: dict[int, tuple[Plan, Tube]] = {}
 
     def tube(plan: Plan) -> Tube:
-        if id(plan) not in tubes:
-            payloads = encode_flight(PlannedFlight("", plan, limits)).payloads
-            boxes = link_loss_tubes(payloads, limits, np.arange(len(payloads)))
-            tubes[id(plan)] = plan, Tube(boxes, RATE, 0.001 * TUBE_PART)
-        return tubes[id(plan)][1]
+        payloads = encode_flight(PlannedFlight("", plan, limits)).payloads
+        return Tube(link_loss_tubes(payloads, limits, np.arange(len(payloads))), RATE, 0.001 * TUBE_PART)
 
     stop = stop_clock(RATE)[0] / RATE
-    return LossModel(tube, stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))
+    return LossModel(once_per_plan(tube), stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))
+
+
+def once_per_plan(make: Callable[[Plan], Made]) -> Callable[[Plan], Made]:
+    """Return a function that makes something of each plan, once."""
+    known: dict[int, tuple[Plan, Made]] = {}  # the plan too, as its id is free once it is gone
+
+    def made(plan: Plan) -> Made:
+        if id(plan) not in known:
+            known[id(plan)] = plan, make(plan)
+        return known[id(plan)][1]
+
+    return made
 
 
 def _given_way(plan: Plan) -> Plan:

@@ -9,7 +9,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
@@ -35,12 +35,14 @@ from cfplan.flight.telemetry import Telemetry, Triple
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.plan_file import save_plan
+from cfplan.preparation.on_board_fleet import prepare_fleet_on_board
+from cfplan.preparation.on_board_flight import PreparedOnBoard
 from cfplan.preparation.plan_fleet import PlannedFleet, plan_fleet, prepare_fleet
 from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import PreparedFlight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.recording.fleet_record import write_fleet_file
-from cfplan.recording.header import header_of_plan
+from cfplan.recording.header import FLOWN, header_of_plan
 from cfplan.recording.reader import read_record
 from cfplan.recording.record import PLAN_FILE
 from cfplan.recording.summary import summarise
@@ -52,6 +54,7 @@ from cfplan.steering.fleet_addresses import VehicleAddress, fleet_addresses, loo
 from cfplan.steering.fleet_room import FleetRoom, VehiclePlace
 from cfplan.steering.real_time_steering import main_module_hidden
 
+_Prepare = Callable[..., tuple[PlannedFleet, tuple[PreparedFlight | PreparedOnBoard, ...]]]
 _LOOK_PERIOD = 0.02  # s between checks of an awaited condition
 _TAKE_OFF_TIMEOUT = 240.0  # s; vehicles take off one after another
 _LAND_TIMEOUT = 120.0  # s
@@ -62,7 +65,7 @@ class ReadyVehicle:
     """A vehicle that is about to fly."""
 
     member: FleetMember
-    prepared: PreparedFlight
+    prepared: PreparedFlight | PreparedOnBoard
     address: VehicleAddress
     source: Path  # its path file
 
@@ -91,6 +94,7 @@ class ConnectedFleet:
         limits: Limits,
         options: FlightOptions | None = None,
         *,
+        on_board: bool = False,
         records: Path | None = None,
         keys: bool = True,
         on_step: OnStep = ignore_steps,
@@ -103,6 +107,7 @@ class ConnectedFleet:
             addresses: of each vehicle, by its name.
             limits: that every vehicle keeps.
             options: of planning.
+            on_board: whether each vehicle flies an uploaded trajectory by its own commander.
             records: the folder in which a folder with the flight's records is written; None writes none.
             keys: whether keys of the terminal count.
             on_step: hears of the steps of preparing.
@@ -122,8 +127,8 @@ class ConnectedFleet:
         self.summary: dict[str, dict[str, Any]] = {}  # figures of `cfplan report` by vehicle, once the flight is over
         try:
             self._pilots = self._start_pilots(addresses)
-            self.plan: PlannedFleet = plan_fleet(fleet, limits, options, on_step)
-            prepared = prepare_fleet(self.plan, on_step)
+            prepare: _Prepare = prepare_fleet_on_board if on_board else _prepare_streamed
+            self.plan, prepared = prepare(fleet, limits, options, on_step)
             self.vehicles = tuple(
                 ReadyVehicle(member, each, addresses[member.name], listed.path_file.source)
                 for member, each, listed in zip(self.plan.members, prepared, fleet.vehicles, strict=True)
@@ -380,6 +385,7 @@ def connect_fleet(
     fleet: Path | str,
     *,
     mocap: str | None = None,
+    on_board: bool = False,
     safety: Limits | Path | str | None = None,
     records: Path | str | None = RECORDS,
     speed_factor: float | None = None,
@@ -392,6 +398,8 @@ def connect_fleet(
         fleet: the fleet file.
         mocap: the motion capture system that sees all vehicles, as vicon://192.168.1.2; virtual ones have poses
             already.
+        on_board: whether each vehicle flies an uploaded trajectory by its own commander, so that only poses are
+            streamed.
         safety: the limits, or the file with them; else the nearest safety.yaml in or above the working folder.
         records: the folder in which the flight's records are written, as a new folder; None writes none.
         speed_factor: of the speed that the limits allow, above 0 and at most 1; None takes each path's own.
@@ -403,11 +411,20 @@ def connect_fleet(
     dongle or a body is missing.
     """
     file = load_fleet_file(Path(fleet))
-    addresses, limits = fleet_addresses(file, mocap), find_limits(safety)
-    look_at_fleet(addresses, limits.pose, on_step)
+    addresses, limits = fleet_addresses(file, mocap, on_board=on_board), find_limits(safety)
+    look_at_fleet(addresses, limits.pose, on_step, on_board=on_board)
     folder = Path(records) if records is not None else None
     options = FlightOptions(speed_factor=speed_factor)
-    return ConnectedFleet(file, addresses, limits, options, records=folder, keys=keys, on_step=on_step)
+    return ConnectedFleet(
+        file, addresses, limits, options, on_board=on_board, records=folder, keys=keys, on_step=on_step
+    )
+
+
+def _prepare_streamed(
+    fleet: FleetFile, limits: Limits, options: FlightOptions | None, on_step: OnStep
+) -> tuple[PlannedFleet, tuple[PreparedFlight, ...]]:
+    planned = plan_fleet(fleet, limits, options, on_step)
+    return planned, prepare_fleet(planned, on_step)
 
 
 def _writer(vehicle: ReadyVehicle, folder: Path) -> RecordWriter:
@@ -417,4 +434,6 @@ def _writer(vehicle: ReadyVehicle, folder: Path) -> RecordWriter:
     header = header_of_plan(
         plan, name=name, uri=vehicle.address.uri, source=vehicle.source, wall_time_at_zero=wall_time_at_zero()
     )
+    if vehicle.prepared.mission.on_board is not None:
+        header = replace(header, provenance={**header.provenance, FLOWN: "on board"})
     return RecordWriter(folder, header)

@@ -6,7 +6,14 @@ from urllib.parse import quote
 
 from cfplan.errors import InputError
 from cfplan.flight.fleet.dongle_process import shared_uri
-from cfplan.flight.fleet.inline_radio import INLINE, dongle_mode, require_capacity, require_inline_settings
+from cfplan.flight.fleet.inline_radio import (
+    INLINE,
+    PACKETS_ON_BOARD,
+    PACKETS_PER_VEHICLE,
+    dongle_mode,
+    require_capacity,
+    require_inline_settings,
+)
 from cfplan.flight.mocap.uri import EXAMPLE, parse_uri
 from cfplan.flight.radio.crazyradio import find_radios
 from cfplan.flight.radio.uri import check_vehicle_uri
@@ -36,12 +43,13 @@ class VehicleAddress:
         return self.uri.startswith(SIMULATED)
 
 
-def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAddress]:
+def fleet_addresses(fleet: FleetFile, mocap: str | None, *, on_board: bool = False) -> dict[str, VehicleAddress]:
     """Return the addresses of all vehicles by their names; a vehicle without `uri` is sim://0, sim://1, ….
 
     Args:
         fleet: the vehicles. One without `body` has its name as its body.
         mocap: the motion capture system that sees all of them, as vicon://192.168.1.2; None for virtual vehicles.
+        on_board: whether the vehicles fly on board, and need fewer packets.
 
     Raises InputError if a URI is wrong, two vehicles have one address or one body, too many share a dongle, some are
     virtual and some are not, or they have no motion capture. Nothing is connected yet.
@@ -58,7 +66,7 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAdd
         sharing = [fleet.vehicles[number].name for number in numbers]
         for name in sharing:
             require_inline_settings(uris[name])
-        require_capacity(dongle, sharing, INLINE)
+        require_capacity(dongle, sharing, INLINE, _packets(on_board))
         dongles |= dict.fromkeys(sharing, dongle)
     return {
         name: VehicleAddress(uri, bodies[name], _body_uri(mocap, bodies[name]), dongles.get(name, ""))
@@ -66,7 +74,14 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None) -> dict[str, VehicleAdd
     }
 
 
-def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, on_step: OnStep) -> None:
+def _packets(on_board: bool) -> float:
+    """Return the packets a second that a vehicle needs."""
+    return PACKETS_ON_BOARD if on_board else PACKETS_PER_VEHICLE
+
+
+def look_at_fleet(
+    addresses: Mapping[str, VehicleAddress], limits: PoseLimits, on_step: OnStep, *, on_board: bool = False
+) -> None:
     """Check, before planning, that each dongle is free and has the capacity for its vehicles, and each body is seen.
 
     Raises a CfplanError.
@@ -77,7 +92,8 @@ def look_at_fleet(addresses: Mapping[str, VehicleAddress], limits: PoseLimits, o
     for dongle in dict.fromkeys(address.dongle for address in addresses.values() if address.dongle):
         with step(on_step, f"dongle {dongle}") as results:
             sharing = [name for name, address in addresses.items() if address.dongle == dongle]
-            results.append(require_capacity(dongle, sharing, dongle_mode(find_radios()[int(dongle)].bcdDevice)))
+            mode = dongle_mode(find_radios()[int(dongle)].bcdDevice)
+            results.append(require_capacity(dongle, sharing, mode, _packets(on_board)))
 
 
 def _require_all_virtual_or_none(fleet: FleetFile, mocap: str | None) -> None:

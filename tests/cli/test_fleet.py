@@ -173,7 +173,7 @@ def test_no_folder_is_made_for_a_fleet_that_is_refused(cfplan, narrow_fleet, saf
     ("command", "words", "what"),
     [
         ("plan", ["-o", "a.parquet"], "plan files are not supported"),
-        ("fly", ["--records", ".", "--on-board"], "do not fly with --on-board"),
+        ("fly", ["--records", ".", "--live"], "do not fly with --live"),
         ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "do not fly with --uri"),
         ("export", ["--to", "samples", "-o", "out.csv"], "a folder with a file per vehicle"),
         ("export", ["--to", "memory", "-o", "line.yaml"], "this is a file"),

@@ -12,4 +12,5 @@ __all__ = [
     "pieces",
     "program",
     "reference",
+    "wait",
 ]

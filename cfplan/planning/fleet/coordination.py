@@ -23,7 +23,7 @@ from cfplan.planning.fleet.clocks import CELL, TICK, Stuck, VehicleClock, cells_
 from cfplan.planning.fleet.hazards import Hazards
 from cfplan.planning.fleet.lost import Loss, LossModel
 from cfplan.planning.fleet.members import FleetMember, places
-from cfplan.planning.fleet.separation import STOP, Separation, separations
+from cfplan.planning.fleet.separation import STOP, Separation, Stops, separations, stop_separations
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.repair import under_caps
 from cfplan.safety.speed_caps import SpeedCaps, allowed_speed
@@ -32,6 +32,7 @@ from cfplan.vehicle.trajectory import Trajectory
 ORDERS = 60  # that are tried, at most
 MADE = 12  # of these, whose plans are slowed and compared; the soonest first
 SLACKS = (0.02, 0.05, 0.1)  # m added to the distance in the search, tried until the certificate passes
+_OFF_PATH_SLACKS = (0.2, 0.35)  # m, more of these, for vehicles that leave their paths to stop
 _BETWEEN_SKEWS = 0.03  # s, largest spacing within the skew in the search
 _LEAST_SPEED = 0.05  # m/s, of caps
 _PLACES = 0.02  # s of a plan between the places of its caps
@@ -90,15 +91,20 @@ class _Track:
 
 
 def coordinate(
-    members: Sequence[FleetMember], apart: float, skew: float, finish: Finish, lost: LossModel | None = None
+    members: Sequence[FleetMember],
+    apart: float,
+    skew: float,
+    finish: Finish,
+    lost: LossModel | None = None,
+    stops: Callable[[Plan], Stops] | None = None,
 ) -> tuple[FleetMember, ...] | Blocked:
     """Return the members with delays and slower plans, whose columns stay `apart`, m, for clocks `skew`, s, apart.
 
     `finish` is applied to each slower plan before it is compared with others. With a model of lost vehicles, the others
-    also keep away from these.
+    also keep away from these. `stops` are those of vehicles that leave their paths to stop.
     """
     hazards = None if lost is None else Hazards.of(members, lost, skew)
-    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish, lost, hazards)
+    search = _Search(tuple(members), apart, skew, _distance_at_rest(members), finish, lost, hazards, stops)
     found: list[tuple[float, tuple[int, ...]]] = []
     blocked: Blocked | None = None
     longest = max(member.plan.trajectory.duration for member in members)
@@ -157,6 +163,7 @@ class _Search:
     finish: Finish
     lost: LossModel | None = None
     hazards: Hazards | None = None
+    stops: Callable[[Plan], Stops] | None = None
 
     def sketch(self, order: tuple[int, ...]) -> list[_Track] | Blocked:
         """Return clocks in an order, without planning again."""
@@ -184,7 +191,7 @@ class _Search:
         """Return the flight of a vehicle that keeps apart from the tracks of others."""
         member = self.members[number]
         blocked: Blocked | None = None
-        for slack in SLACKS:
+        for slack in SLACKS if self.stops is None else (*SLACKS, *_OFF_PATH_SLACKS):
             clock = self._clock(number, tracks, slack)
             if isinstance(clock, Blocked):
                 return blocked or clock
@@ -194,7 +201,7 @@ class _Search:
                 slows = int(np.argmax((clock.rate > 0.0) & (clock.rate < 1.0)))
                 blocked = self._blocked(number, Stuck(CELL * float(clock.own[slows]), TICK * slows), tracks)
                 continue
-            nearest = _nearest(made, tracks, self.skew)
+            nearest = self._nearest(made, tracks)
             if nearest is not None and not nearest.keeps(self.apart):
                 blocked = _blocked_by(nearest)
                 continue
@@ -207,6 +214,17 @@ class _Search:
             blocked = _blocked_by(lost)
         assert blocked is not None
         return blocked
+
+    def _nearest(self, made: FleetMember, tracks: list[_Track]) -> Separation | None:
+        """Return the nearest approach to the tracks of others, also when all brake; None if there are none."""
+        found = []
+        for track in tracks:
+            if track.member is not None:
+                pair = made, track.member
+                found.append(separations(pair, self.skew)[0])
+                if self.stops is not None:
+                    found.append(stop_separations(pair, [self.stops(each.plan) for each in pair], self.skew)[0])
+        return min(found, key=lambda each: each.distance, default=None)
 
     def _clock(self, number: int, tracks: list[_Track], slack: float) -> VehicleClock | Blocked:
         """Return the fastest clock of a vehicle among the tracks of others."""
@@ -266,12 +284,6 @@ def _distance_at_rest(members: Sequence[FleetMember]) -> float:
 def _blocked_by(near: Separation | Loss) -> Blocked:
     """Return which pair comes too near, as the reason why a vehicle gets no farther."""
     return Blocked(near.pair, near.place, near.time)
-
-
-def _nearest(made: FleetMember, tracks: list[_Track], skew: float) -> Separation | None:
-    """Return the nearest approach to the tracks of others; None if there are none."""
-    found = [separations((made, track.member), skew)[0] for track in tracks if track.member]
-    return min(found, key=lambda each: each.distance, default=None)
 
 
 def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:

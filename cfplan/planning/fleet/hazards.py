@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.planning.fleet.clocks import CELL, TICK
-from cfplan.planning.fleet.lost import LossModel, distances, groups_among, tubes_apart
+from cfplan.planning.fleet.lost import LossModel, groups_among, tubes_apart
 from cfplan.planning.fleet.members import FleetMember
 
 STRIDE = 3 * TICK  # s of a plan's own time, from one row of a map to the next
@@ -36,8 +36,8 @@ class Hazards:
             a, b = (_own_times(members[n].plan.trajectory.duration) for n in (i, j))
             own_a, own_b = (each.ravel() for each in np.meshgrid(a, b, indexing="ij"))
             found = np.minimum(
-                distances(tubes[i], own_a, (members[j].plan, own_b), lost.stop, skew, far=far),
-                distances(tubes[j], own_b, (members[i].plan, own_a), lost.stop, skew, far=far),
+                lost.distances(tubes[i], own_a, (members[j].plan, own_b), skew, far=far),
+                lost.distances(tubes[j], own_b, (members[i].plan, own_a), skew, far=far),
             )
             if any(groups_among(lost.together, (i, j))):
                 found = np.minimum(found, tubes_apart(tubes[i], own_a, tubes[j], own_b, skew))

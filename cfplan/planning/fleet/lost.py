@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from cfplan.machine_code import njit
 from cfplan.planning.fleet.members import FleetMember, places
+from cfplan.planning.fleet.separation import Stops
 from cfplan.planning.plan_result import Plan
 from cfplan.safety.space import inside
 
@@ -45,10 +46,11 @@ class Tube(NamedTuple):
     boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways, a lost link the last
     rate: float  # Hz, of the R setpoints
     part: float  # s of each part; the last one, in which it lies, lasts
+    begins: int = 0  # row of the plan's first setpoint; those before it are of a vehicle that still waits
 
     def rows(self, own: NDArray) -> NDArray:
-        """Return the setpoint in force at own times of the plan, (N,) s: before its start the first one."""
-        return np.clip(np.round(own * self.rate), 0, self.boxes.shape[1] - 1).astype(np.int64)
+        """Return the rows at own times of the plan, (N,) s: before its start the first one."""
+        return np.clip(np.round(own * self.rate) + self.begins, 0, self.boxes.shape[1] - 1).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,9 +96,15 @@ class LossModel:
     """What vehicles do when one is lost, and how far they keep away."""
 
     tube: Callable[[Plan], Tube]
-    stop: NDArray  # (M,) s, how far a stop goes on along a plan, at the rate of setpoints
+    stop: NDArray | Callable[[Plan], Stops]
+    """How far, (M,) s at the rate of setpoints, a stop goes on along a plan; or the stops of a plan that leave it."""
     together: tuple[tuple[int, ...], ...]  # numbers of the vehicles that share a dongle, of two or more
     clearance: float  # m, from a tube to the other columns
+
+    @property
+    def stops(self) -> Callable[[Plan], Stops] | None:
+        """Return the stops of a plan that leave it; None for those along it."""
+        return self.stop if callable(self.stop) else None
 
     def losses(self, members: Sequence[FleetMember], numbers: Sequence[int], skew: float) -> tuple[Loss, ...]:
         """Return the worst moment to lose each of some vehicles of a fleet, and each dongle, the nearest first.
@@ -108,7 +116,7 @@ class LossModel:
         own = [times - member.delay for member in members]
         away = np.full((count, count, len(times)), np.inf)  # lost, other, time
         for i, j in itertools.permutations(range(count), 2):
-            away[i, j] = distances(tubes[i], own[i], (members[j].plan, own[j]), self.stop, skew)
+            away[i, j] = self.distances(tubes[i], own[i], (members[j].plan, own[j]), skew)
         worst = []
         for group in (*((n,) for n in range(count)), *groups_among(self.together, numbers)):
             table = np.full_like(away, np.inf)
@@ -119,6 +127,18 @@ class LossModel:
                 table[i, j] = tubes_apart(tubes[i], own[i], tubes[j], own[j], skew)
             worst.append(self._worst(group, table, times, members))
         return tuple(sorted(worst, key=lambda each: each.distance))
+
+    def distances(
+        self, tube: Tube, lost: NDArray, other: tuple[Plan, NDArray], skew: float, *, far: float = np.inf
+    ) -> NDArray:
+        """Return the least distance from a tube to the column of another vehicle that brakes, (N,) m.
+
+        `lost`, (N,) s, are own times of the vehicle when its link is lost; `other` are the plan and own times of the
+        other. Distances above `far`, m, are returned as that.
+        """
+        if callable(self.stop):
+            return _off_path(tube, lost, self.stop(other[0]), other[1], skew, far)
+        return _along_path(tube, lost, other, self.stop, skew, far)
 
     def _worst(self, group: tuple[int, ...], away: NDArray, times: NDArray, members: Sequence[FleetMember]) -> Loss:
         """Return the moment at which others are least away; `away` has lost, other, time."""
@@ -145,14 +165,10 @@ def groups_among(together: Sequence[tuple[int, ...]], numbers: Sequence[int]) ->
             yield some
 
 
-def distances(
-    tube: Tube, lost: NDArray, other: tuple[Plan, NDArray], stop: NDArray, skew: float, *, far: float = np.inf
+def _along_path(
+    tube: Tube, lost: NDArray, other: tuple[Plan, NDArray], stop: NDArray, skew: float, far: float
 ) -> NDArray:
-    """Return the least distance from a tube to the column of another vehicle that brakes, (N,) m.
-
-    `lost`, (N,) s, are own times of the vehicle when its link is lost; `other` are the plan and own times of the other.
-    Distances above `far`, m, are returned as that.
-    """
+    """Return the distances to a vehicle that brakes along its path."""
     plan, own = other
     trajectory = plan.trajectory
     samples = places(trajectory, np.arange(0.0, trajectory.duration + _SAMPLE, _SAMPLE))
@@ -227,6 +243,58 @@ def _nearest_sample(
         least = min(least, away)
         k += 1 + int((away - least) / per_sample)
     return least
+
+
+def _off_path(tube: Tube, lost: NDArray, stops: Stops, own: NDArray, skew: float, far: float) -> NDArray:
+    """Return the distances to a vehicle that leaves its path to stop."""
+    late, (soonest, latest) = np.ceil(skew * stops.rate), NOTICED
+    begins = np.arange(np.floor(soonest * stops.rate) - late, np.ceil(latest * stops.rate) + late + 1)
+    window = np.array([-late, np.ceil(tube.part * stops.rate) + late])
+    rows = np.round(np.clip(own, -_RESTS, _RESTS) * stops.rate).astype(np.int64)
+    found = _least_off_path(
+        tube.boxes, tube.rows(lost), stops.places, rows, begins.astype(np.int64), window.astype(np.int64),
+        tube.part * stops.rate, far,
+    )  # fmt: skip
+    return np.asarray(found - stops.between)
+
+
+@njit(nogil=True, error_model="numpy")
+def _least_off_path(
+    boxes: NDArray, rows: NDArray, places: NDArray, own: NDArray, begins: NDArray, window: NDArray, part: float,
+    far: float,
+) -> NDArray:  # fmt: skip
+    """Return the least distances, (N,) m, of boxes to a vehicle that begins one of its stops after the loss.
+
+    `places`, (R, M, 2) m, are those of the stops from each of its setpoints, of which `own`, (N,), are in force at the
+    loss; `begins`, (B,), are periods until a stop begins. A part of the tube lasts `part` periods, and is compared with
+    the periods in `window` about its begin.
+    """
+    out = np.full(len(rows), far)
+    setpoints, last = len(places) - 1, places.shape[1] - 1
+    for n in range(len(rows)):
+        for way in range(boxes.shape[0]):
+            for number in range(boxes.shape[2]):
+                low, high = boxes[way, rows[n], number, 0], boxes[way, rows[n], number, 1]
+                lies = high[2] <= 0.0
+                first = int(np.floor(number * part)) + window[0]
+                for begin in begins:
+                    row = min(max(own[n] + begin, 0), setpoints)
+                    for k in range(first, first + window[1] - window[0] + 2):
+                        if lies:
+                            x, y = places[row, last]
+                        elif k < begin:
+                            x, y = places[min(max(own[n] + k, 0), setpoints), 0]
+                        else:
+                            x, y = places[row, min(k - begin, last)]
+                        a, b = max(low[0] - x, x - high[0], 0.0), max(low[1] - y, y - high[1], 0.0)
+                        away = np.sqrt(a * a + b * b)
+                        if away < out[n] or np.isnan(away):
+                            out[n] = away
+                        if lies:
+                            break
+                if lies:
+                    break
+    return out
 
 
 def tubes_apart(tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:

@@ -7,10 +7,14 @@ standing are all in the columns of start and end, so the distance between column
 The clocks of two vehicles differ by at most the skew, so each moment of one is compared with all moments of the other
 within the skew. The distance that a vehicle may move between samples, at its certified speed, is subtracted.
 
-Each stop slows the clock along the path by the same law, so vehicles that brake at the same tick pass through pairs of
-positions that are compared here, and rest at such a pair. The order to brake may reach them at different times, which
-adds to the skew. A vehicle that has not begun yet stays at its start when all brake, while the others go on along their
-paths. So each start is also compared with the places of the others until STOP after the vehicle there would have begun.
+Each streamed stop slows the clock along the path by the same law, so vehicles that brake at the same tick pass through
+pairs of positions that are compared here, and rest at such a pair. The order to brake may reach them at different
+times, which adds to the skew. A vehicle that has not begun yet stays at its start when all brake, while the others go
+on along their paths. So each start is also compared with the places of the others until STOP after the vehicle there
+would have begun.
+
+A vehicle that flies on board leaves its path to stop. So the stops of two vehicles from all setpoints within the skew
+are compared with each other as well.
 
 A vehicle is not exactly on its path. `apart` has room for the deviation of both, and leaves CLEAR between them.
 
@@ -20,6 +24,7 @@ A vehicle without poses or without its link leaves its path, which this certific
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +46,19 @@ def allowed_deviation(apart: float) -> float:
     return 0.5 * (apart - CLEAR)
 
 
+class Stops(NamedTuple):
+    """Stops that leave the path, from each setpoint of a plan."""
+
+    places: NDArray  # (R, M, 2) m, x and y, of a stop from each of R setpoints; the first is that of the setpoint
+    rate: float  # Hz, of setpoints and of the places of a stop
+    speed: float  # m/s, at most
+
+    @property
+    def between(self) -> float:
+        """Return how far, m, the vehicle may be from the nearest of the places."""
+        return self.speed / self.rate + _BETWEEN
+
+
 @dataclass(frozen=True, slots=True)
 class Separation:
     """The nearest approach of the columns of two vehicles."""
@@ -49,11 +67,13 @@ class Separation:
     distance: float  # m, lower bound, including between samples and over the skew
     place: tuple[float, float]  # m, x and y, in the middle between them
     time: float  # s after the fleet's start
+    braked: bool = False  # whether it is after all have begun to brake at that time, off their paths
 
     def __str__(self) -> str:
         a, b = self.pair
         x, y = self.place
-        return f"{a} and {b} {self.distance:.3f} m apart at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s"
+        braked = ", when all brake" if self.braked else ""
+        return f"{a} and {b} {self.distance:.3f} m apart at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s{braked}"
 
     def keeps(self, apart: float) -> bool:
         """Return whether the two keep that distance, m."""
@@ -89,6 +109,44 @@ def _while_waiting(a: FleetMember, b: FleetMember, skew: float) -> tuple[float, 
     away = np.linalg.norm(columns - start, axis=1)
     row = int(away.argmin())
     return float(away[row]), 0.5 * (columns[row] + start), float(times[row])
+
+
+def stop_separations(members: Sequence[FleetMember], stops: Sequence[Stops], skew: float) -> tuple[Separation, ...]:
+    """Return how near each pair comes when all leave their paths to stop, the nearest first; as separations()."""
+    found = []
+    for i, j in itertools.combinations(range(len(members)), 2):
+        a, b, rate = stops[i], stops[j], stops[i].rate
+        times = np.arange(int(np.ceil(max(members[i].end, members[j].end) * rate)) + 1)
+        rows = [np.round(times - rate * members[n].delay).astype(np.int64) for n in (i, j)]
+        least, time, place, other = _nearest_stops(a.places, rows[0], b.places, rows[1], int(np.ceil(skew * rate)) + 1)
+        x, y = (0.5 * (np.array(place) + np.array(other))).tolist()
+        distance = max(float(least) - a.between - b.between, 0.0)
+        found.append(Separation((members[i].name, members[j].name), distance, (x, y), time / rate, braked=True))
+    return tuple(sorted(found, key=lambda each: each.distance))
+
+
+@njit(nogil=True, error_model="numpy")
+def _nearest_stops(
+    a: NDArray, rows_of_a: NDArray, b: NDArray, rows_of_b: NDArray, band: int
+) -> tuple[float, int, tuple[float, float], tuple[float, float]]:
+    """Return the least distance of two vehicles that stop, the number of its rows, and the places of both.
+
+    `a` and `b` are (R, M, 2) m; rows and places are at most `band` apart. A row before the first one is a hover.
+    """
+    least, at = np.inf, 0
+    place, other = (0.0, 0.0), (0.0, 0.0)
+    for n in range(len(rows_of_a)):
+        row = min(max(rows_of_a[n], 0), len(a) - 1)
+        for late in range(-band, band + 1):
+            row_of_b = min(max(rows_of_b[n] + late, 0), len(b) - 1)
+            for k in range(a.shape[1]):
+                for m in range(max(k - band, 0), min(k + band + 1, b.shape[1])):
+                    away = (a[row, k, 0] - b[row_of_b, m, 0]) ** 2 + (a[row, k, 1] - b[row_of_b, m, 1]) ** 2
+                    if away < least or np.isnan(away):
+                        least, at = away, n
+                        place = (a[row, k, 0], a[row, k, 1])
+                        other = (b[row_of_b, m, 0], b[row_of_b, m, 1])
+    return np.sqrt(least), at, place, other
 
 
 @njit(nogil=True, error_model="numpy")

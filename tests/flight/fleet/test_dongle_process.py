@@ -13,7 +13,7 @@ from waiting import a_moment, until
 from cfplan.errors import InputError, LinkError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.fleet.dongle_process import SharedDongles, shared_uri
-from cfplan.flight.fleet.inline_radio import dongle_mode, require_capacity
+from cfplan.flight.fleet.inline_radio import PACKETS_ON_BOARD, PACKETS_PER_VEHICLE, dongle_mode, require_capacity
 from cfplan.flight.fleet.shared_dongle import NEVER_HEARD_AFTER
 from cfplan.flight.radio.radio_lock import lock_radio
 from cfplan.flight.radio.transport import start_receiver
@@ -170,19 +170,22 @@ def test_a_radio_that_cannot_be_opened_is_an_error_of_each_pilot():
 
 
 @pytest.mark.parametrize(
-    ("count", "firmware", "parts"),
+    ("count", "packets", "firmware", "parts"),
     [
-        (2, 0x0501, None),
-        (4, 0x0504, None),
-        (5, 0x0510, ("need 1050", "carries 975", "enough for 4 vehicles")),
-        (2, 0x0500, ("need 420", "carries 225", "enough for 1 vehicle", "firmware 5.1")),
-        (2, 0x0053, ("USB set-up",)),  # a Crazyradio PA
+        (2, PACKETS_PER_VEHICLE, 0x0501, None),
+        (4, PACKETS_PER_VEHICLE, 0x0504, None),
+        (5, PACKETS_PER_VEHICLE, 0x0510, ("need 1050", "carries 975", "enough for 4 vehicles", "--on-board")),
+        (2, PACKETS_PER_VEHICLE, 0x0500, ("need 420", "carries 225", "enough for 1 vehicle", "firmware 5.1")),
+        (2, PACKETS_PER_VEHICLE, 0x0053, ("USB set-up",)),  # a Crazyradio PA
+        (6, PACKETS_ON_BOARD, 0x0501, None),
+        (2, PACKETS_ON_BOARD, 0x0053, ("need 240", "carries 225", "enough for 1 vehicle")),
     ],
 )
-def test_a_dongle_short_of_capacity_is_refused_with_need_and_capacity(count, firmware, parts):
-    require = partial(require_capacity, "0", [f"cf{number}" for number in range(count)], dongle_mode(firmware))
+def test_a_dongle_short_of_capacity_is_refused_with_need_and_capacity(count, packets, firmware, parts):
+    names = [f"cf{number}" for number in range(count)]
+    require = partial(require_capacity, "0", names, dongle_mode(firmware), packets)
     if parts is None:
-        assert f"{210 * count} packets a second" in require()
+        assert f"{packets * count:.0f} packets a second" in require()
         return
     with pytest.raises(InputError) as caught:
         require()

@@ -10,7 +10,7 @@ from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import stop_clock, stop_motion
 from cfplan.planning.fleet.coordination import Blocked, coordinate
-from cfplan.planning.fleet.lost import NOTICED, LossModel, Tube, distances, tubes_apart
+from cfplan.planning.fleet.lost import NOTICED, LossModel, Tube, tubes_apart
 from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.dry_run import fly_drawn, rehearsed_flight
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
@@ -50,6 +50,10 @@ def coordinated(crossing, model):
     made = coordinate(crossing, APART, SKEW, lambda slower: slower, model())
     assert not isinstance(made, Blocked)
     return made
+
+
+def distances(tube, lost, other):
+    return LossModel(lambda plan: tube, STOP, (), CLEARANCE).distances(tube, lost, other, SKEW)
 
 
 def stopping(member, encoded, loss: float, begins: float, late: float) -> np.ndarray:
@@ -116,7 +120,7 @@ def test_a_vehicle_that_waits_when_told_to_brake_stays_at_its_start(crossing):
     boxes = np.full((1, 1, 60, 2, 3), 50.0)
     boxes[0, 0, 25:] = start  # from 1 s on
     tube = Tube(boxes, RATE, 0.04)
-    braking = distances(tube, np.zeros(4), (other, np.array([-0.5, -0.3, -0.05, 0.5])), STOP, SKEW)
+    braking = distances(tube, np.zeros(4), (other, np.array([-0.5, -0.3, -0.05, 0.5])))
     assert braking[:3] == pytest.approx(0.0, abs=0.02)
     assert braking[3] > 0.2
 
@@ -128,7 +132,7 @@ def test_a_link_that_comes_back_leaves_its_vehicle_where_its_tube_was(crossing, 
     own = 0.5 * other.trajectory.duration - 0.5
     boxes = np.full((1, 1, 60, 2, 3), 50.0)
     boxes[0, 0, part] = other.trajectory.at(own + 0.9).position
-    away = distances(Tube(boxes, RATE, 0.04), np.zeros(1), (other, np.array([own])), STOP, SKEW)
+    away = distances(Tube(boxes, RATE, 0.04), np.zeros(1), (other, np.array([own])))
     assert away[0] < 0.02 if stays else away[0] > 0.2
 
 
@@ -163,12 +167,12 @@ def test_a_tube_is_compared_with_each_place_that_the_other_may_be_at(crossing):
     )
     tube, duration = Tube(box[None], RATE, 0.04), other.trajectory.duration
     own = np.array([-np.inf, 0.0, duration / 2, duration])
-    braking = distances(tube, np.zeros(4), (other, own), STOP, SKEW)
+    braking = distances(tube, np.zeros(4), (other, own))
     end = np.hypot(1.1, 0.5)
     assert braking[0] == pytest.approx(end, abs=0.02)  # it waits where it starts
     assert braking[2] == pytest.approx(0.5, abs=0.02)
     box[..., 0, 0] = np.nan
-    assert np.isnan(distances(Tube(box[None], RATE, 0.04), np.zeros(4), (other, own), STOP, SKEW)).all()
+    assert np.isnan(distances(Tube(box[None], RATE, 0.04), np.zeros(4), (other, own))).all()
 
 
 def test_boxes_of_two_tubes_are_compared_part_by_part():
