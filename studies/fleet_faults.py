@@ -9,7 +9,7 @@ Some faults are not covered by the certificate of a fleet (docs/fleets.md); thei
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from enum import StrEnum
@@ -420,15 +420,15 @@ def tables(settings: Settings, rows: list[FaultyFleetFlight]) -> Iterator[Table]
     bad, kinds, phases = [row for row in rows if row.bad], list(map(str, Kind)), list(map(str, Phase))
     title = f"{len(rows)} flights with one fault each, {len(bad)} went wrong"
 
-    def grouped(name: str, title: str, by: str, heading: str, order: Callable[[str], object]) -> Table:
+    def grouped(name: str, title: str, by: str, heading: str, order: list[str] | None = None) -> Table:
         columns = (Column(by, heading), *_COUNTS)
-        found = sorted(rows, key=lambda row: order(getattr(row, by)))  # type: ignore[arg-type,return-value]
+        found = sorted(rows, key=attrgetter(by) if order is None else lambda row: order.index(getattr(row, by)))
         return table(name, title, columns, found, by=(by,), last="all")
 
-    yield grouped("all", title, "coverage", "faults", str)
-    yield grouped("kinds", "By fault", "kind", "fault", kinds.index)
-    yield grouped("fleets", "By fleet", "size", "fleet", str)
-    yield grouped("phases", "By the phase of the struck vehicle", "phase", "phase", phases.index)
+    yield grouped("all", title, "coverage", "faults")
+    yield grouped("kinds", "By fault", "kind", "fault", kinds)
+    yield grouped("fleets", "By fleet", "size", "fleet")
+    yield grouped("phases", "By the phase of the struck vehicle", "phase", "phase", phases)
     yield table("worst", "Nearest to each other", FLIGHT_COLUMNS, sorted(rows, key=attrgetter("nearest"))[:_NEAREST])
     yield table("bad", f"{len(bad)} flights went wrong", FLIGHT_COLUMNS, bad)
 
