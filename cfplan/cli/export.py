@@ -46,15 +46,16 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
     Polynomials stay within 2 cm of the plan and within every limit; if they cannot, the entire flight is slowed down.
     The simulator flies them as the vehicle's own commander would.
 
-    For a fleet file: write one file per vehicle, to be started at one time.
+    For a fleet file: write one file per vehicle, to be started simultaneously.
     """
     plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
     steps = Steps(as_json=as_json)
-    is_fleet = fleet.is_fleet(path_or_plan)
-    _check(form, output, pieces, force=force, is_fleet=is_fleet)
-    if is_fleet:
+    _check_pieces(form, pieces)
+    if fleet.is_fleet(path_or_plan):
+        fleet.check_folder(output, force)
         settings = fleet.ExportSettings(form, output, leads=not plain, pieces=pieces, rate=rate)
         return fleet.export_and_print(path_or_plan, safety_file, rest, settings, steps)
+    _check_file(form, output, force)
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
         from cfplan.cli.certificate_table import print_certificate
@@ -82,24 +83,20 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
         print_certificate(certificate)
 
 
-def _check(form: str, output: Path, pieces: int | None, *, force: bool, is_fleet: bool) -> None:
-    """Raise InputError, before anything is planned, if the file or folder could not be written."""
-    suffix = "" if is_fleet else ".bin" if form in ("memory", "compressed") else ".csv"
-    if is_fleet and output.suffix in (".bin", ".csv"):
-        raise InputError(
-            "a fleet is written as a folder with a file per vehicle", where=str(output), hint=f"name it {output.stem}"
-        )
-    if not is_fleet and output.suffix != suffix:
+def _check_pieces(form: str, pieces: int | None) -> None:
+    if pieces is not None and form != "crazyswarm" and pieces > 31:
+        raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
+
+
+def _check_file(form: str, output: Path, force: bool) -> None:
+    """Raise InputError, before anything is planned, if the file could not be written."""
+    suffix = ".bin" if form in ("memory", "compressed") else ".csv"
+    if output.suffix != suffix:
         raise InputError(
             f"{form} is written as {suffix}, not as {output.suffix or 'a file without suffix'}",
             where=str(output), hint=f"name it {output.with_suffix(suffix).name}",
         )  # fmt: skip
-    if pieces is not None and form != "crazyswarm" and pieces > 31:
-        raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
-    if is_fleet and output.exists() and not output.is_dir():
-        raise InputError("this is a file", where=str(output), hint="name a folder; it need not exist yet")
     if output.exists() and not force:
-        what = "folder" if is_fleet else "file"
-        raise InputError(f"the {what} already exists", where=str(output), hint="give --force to overwrite it")
+        raise InputError("the file already exists", where=str(output), hint="give --force to overwrite it")
     if not output.absolute().parent.is_dir():
         raise InputError("no such folder", where=str(output.parent), hint="make it first")

@@ -1,6 +1,8 @@
 """Commands on a fleet file: plan, check, rehearse and export all vehicles together."""
 
-from collections.abc import Mapping
+import contextlib
+import tempfile
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -90,42 +92,72 @@ def export_and_print(
 ) -> None:
     """Plan a fleet, write a file per vehicle, and print when each begins and how near each pair comes."""
     limits, flight = options.read_limits(safety_file, file, steps), options.flight_options(planning, safety_file, file)
+    _require_file_names(file)
     with steps.waiting("loading planners"):
         from cfplan.preparation import export_fleet, export_flight
 
-    form, folder = export_flight.Form(settings.form), settings.output
+    form = export_flight.Form(settings.form)
     fleet = export_fleet.plan_fleet_to_export(file, limits, flight, steps, form=form)
+    fitted = None
     if form is not export_flight.Form.SAMPLES:
         most = settings.pieces or export_flight.MOST_PIECES
-        fit = export_fleet.export_fit(form, leads=settings.leads, most=most)
-        fitted = export_fleet.fit_fleet(fleet, fit, steps)
-        fleet, polynomials = fitted.fleet, fitted.waiting
+        fitted = export_fleet.fit_fleet(fleet, export_fleet.export_fit(form, leads=settings.leads, most=most), steps)
+        fleet = fitted.fleet
     documents = []
-    with steps.step("save") as results:
-        _make_folder(folder)
-        for number, member in enumerate(fleet.members):
+    with steps.step("save") as results, _new_folder(settings.output) as folder:
+        for number, (member, planned) in enumerate(zip(fleet.members, fleet.flights, strict=True)):
             written = folder / f"{member.name}{form.suffix}"
-            if form is export_flight.Form.SAMPLES:
-                count = export_flight.write_samples(fleet.flights[number], settings.rate, written, member.delay)
-                documents.append({"file": str(written), "samples": count})
+            if fitted is None:
+                count = export_flight.write_samples(planned, settings.rate, written, member.delay)
+                document: dict[str, Any] = {"samples": count}
             else:
-                export_flight.write_polynomials(polynomials[number], form, written)
-                documents.append({"file": str(written)} | polynomials[number].to_dict())
-            results.append(str(written))
+                exported = fitted.waiting[number]
+                export_flight.write_polynomials(exported, form, written)
+                document = exported.to_dict() | {"slowing": fitted.slowing}
+            documents.append({"export": document | {"file": str(settings.output / written.name)}})
+            results.append(written.name)
     if steps.as_json:
-        document = fleet.to_dict()
-        vehicles = [each | {"export": more} for each, more in zip(document["vehicles"], documents, strict=True)]
-        print_json(document | {"vehicles": vehicles})
+        whole = fleet.to_dict()
+        vehicles = [each | more for each, more in zip(whole["vehicles"], documents, strict=True)]
+        print_json(whole | {"vehicles": vehicles})
     else:
         _print_tables(fleet)
 
 
-def _make_folder(folder: Path) -> None:
+def _require_file_names(file: Path) -> None:
+    """Raise InputError for a vehicle whose name cannot be that of a file."""
+    from cfplan.planning.fleet.fleet_file import load_fleet_file
+
+    for vehicle in load_fleet_file(file).vehicles:
+        if "/" in vehicle.name or vehicle.name.startswith("."):
+            raise InputError(
+                f"no file can be named after the vehicle {vehicle.name!r}", where=str(file),
+                hint="name it by letters and digits",
+            )  # fmt: skip
+
+
+def check_folder(folder: Path, force: bool) -> None:
+    """Raise InputError, before anything is planned, if a fleet could not be written to the folder."""
+    if folder.exists() and not folder.is_dir():
+        raise InputError("this is a file", where=str(folder), hint="name a folder; it need not exist yet")
+    if folder.exists() and not force:
+        raise InputError("the folder already exists", where=str(folder), hint="give --force to write into it")
+    if not folder.absolute().parent.is_dir():
+        raise InputError("no such folder", where=str(folder.parent), hint="make it first")
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """Yield a folder to write to, whose files come into `folder` once all are written. Raises InputError."""
     try:
-        folder.mkdir(exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.absolute().parent) as unfinished:
+            yield Path(unfinished)
+            folder.mkdir(exist_ok=True)
+            for file in Path(unfinished).iterdir():
+                file.replace(folder / file.name)
     except OSError as error:
         raise InputError(
-            f"the folder cannot be made ({error.strerror or error})", where=str(folder),
+            f"the folder cannot be written ({error.strerror or error})", where=str(folder),
             hint="name a folder in one that can be written",
         ) from error  # fmt: skip
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from cfplan.errors import NotCertifiedError
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.wait import WAIT_SIZE, WAIT_STEP, with_wait
+from cfplan.numbers import shown
 from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.preparation.export_flight import ExportedFlight, Form, fit_polynomials, limits_for_polynomials, slowed
@@ -25,20 +26,21 @@ from cfplan.preparation.plan_fleet import (
     steps_of,
 )
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
-from cfplan.preparation.steps import OnStep, ignore_steps
+from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.limits import Limits
 
 _ATTEMPTS = 5  # to slow all together
-_MORE = 0.005  # of the duration, by which all are slowed beyond what was found, as each fit is another
+_SLOWING_MARGIN = 0.005  # extra slowing, because every fit differs
 
 Fit = Callable[[PlannedFlight, float, OnStep], ExportedFlight]  # of a flight that begins after a wait, s
 
 
 @dataclass(frozen=True, slots=True)
 class FittedFleet:
-    """A fleet as slow as its polynomials, and these, without waits."""
+    """A fleet slowed to the pace of its polynomials, and the polynomials without waits."""
 
     fleet: PlannedFleet
+    slowing: float  # times the duration as planned
     exported: tuple[ExportedFlight, ...]  # of each vehicle
 
     @property
@@ -56,7 +58,7 @@ def plan_fleet_to_export(
     *,
     form: Form,
 ) -> PlannedFleet:
-    """Plan a fleet that other tools fly, without regard to lost vehicles, for which nobody brakes there.
+    """Plan a fleet for other tools. Lost vehicles are not considered: other tools do not brake for them.
 
     Raises as plan_fleet().
     """
@@ -71,17 +73,16 @@ def fit_fleet(fleet: PlannedFleet, fit: Fit, on_step: OnStep = ignore_steps) -> 
 
     Raises NotCertifiedError if a fit does, if all cannot be slowed together, or if a pair comes too near.
     """
-    slower, exported = _fitted_together(fleet, fit, on_step)
-    found = certify_separation(slower, slower.members, None, on_step)
-    slower = replace(slower, separations=found)
-    require_allowed_deviation(
-        slower, {member.name: each.dry_run for member, each in zip(slower.members, exported, strict=True)}, on_step
-    )
-    return FittedFleet(slower, exported)
+    fitted = _fitted_together(fleet, fit, on_step)
+    slower = fitted.fleet
+    slower = replace(slower, separations=certify_separation(slower, slower.members, None, on_step))
+    dry_runs = {member.name: each.dry_run for member, each in zip(slower.members, fitted.exported, strict=True)}
+    require_allowed_deviation(slower, dry_runs, on_step)
+    return replace(fitted, fleet=slower)
 
 
-def _fitted_together(fleet: PlannedFleet, fit: Fit, on_step: OnStep) -> tuple[PlannedFleet, tuple[ExportedFlight, ...]]:
-    """Return the fleet slowed by the factor at which the polynomials of all pass, and these."""
+def _fitted_together(fleet: PlannedFleet, fit: Fit, on_step: OnStep) -> FittedFleet:
+    """Slow all vehicles by the factor at which the polynomials of all pass."""
     slowing = 1.0
     for _ in range(_ATTEMPTS):
         slower = replace(fleet, members=tuple(_slowed(member, slowing, fleet.limits) for member in fleet.members))
@@ -90,10 +91,12 @@ def _fitted_together(fleet: PlannedFleet, fit: Fit, on_step: OnStep) -> tuple[Pl
             exported.append(fit(flight, member.delay, steps_of(member.name, on_step)))
         more = max(each.on_board.reference.slowing for each in exported)
         if more == 1.0:
-            return slower, tuple(exported)
-        slowing *= more + _MORE
+            return FittedFleet(slower, slowing, tuple(exported))
+        slowing *= more + _SLOWING_MARGIN
+        with step(on_step, "slower together") as results:
+            results.append(f"by {shown(100.0 * (slowing - 1.0), '.1f')} % for polynomials")
     raise NotCertifiedError(
-        f"polynomials that are slowed together still exceed a limit at {slowing:.2f} times the planned duration",
+        f"polynomials still exceed a limit after all were slowed together {_ATTEMPTS - 1} times",
         where=fleet.name,
         hint="plan with a lower --speed",
     )
@@ -110,6 +113,8 @@ def export_fit(form: Form, *, leads: bool = True, most: int = MOST_PIECES) -> Fi
 
     def fit(flight: PlannedFlight, wait: float, on_step: OnStep) -> ExportedFlight:
         waits = wait > 0.0
+        if most <= waits:
+            raise NotCertifiedError("its wait takes the only piece", where=flight.name, hint="allow two pieces or more")
         room = MEMORY_SIZE - WAIT_SIZE * waits
         return fit_polynomials(flight, form, leads=leads, most=most - waits, room=room, on_step=on_step)
 

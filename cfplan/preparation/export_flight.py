@@ -96,7 +96,7 @@ def plan_for_polynomials(
 
 
 def limits_for_polynomials(limits: Limits) -> Limits:
-    """Return the limits for a plan to which polynomials are fitted: less angular acceleration, which they exceed."""
+    """Return the limits for a plan to which polynomials are fitted: less angular acceleration, as fits overshoot it."""
     gentle = replace(limits.plan, angular_acceleration=GENTLE * limits.plan.angular_acceleration)
     streamed_loss = replace(limits.link_loss, only_warn=True)  # there is no stream
     return replace(limits, plan=gentle, link_loss=streamed_loss)

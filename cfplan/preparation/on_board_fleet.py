@@ -4,6 +4,7 @@
                together → programs → the certificates of every pair, of all stops, and of lost vehicles
 
 A vehicle whose link is lost flies on, until its watchdog stops the motors. The others stop by go-to, off their paths.
+Commands take longer to be obeyed than setpoints, which adds to the skew.
 """
 
 from collections.abc import Callable
@@ -12,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
+from cfplan.flight.fleet.conductor import OBEYS_LATE
 from cfplan.flight.on_board.fall import fall_tubes
 from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, stop_targets
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.planning.fleet.fleet_file import FleetFile
-from cfplan.planning.fleet.lost import LossModel, Tube
+from cfplan.planning.fleet.lost import BACK, LossModel, Tube
 from cfplan.planning.fleet.separation import Stops, allowed_deviation
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.export_fleet import fit_fleet
@@ -46,7 +48,8 @@ from cfplan.safety.limits import Limits
 from cfplan.vehicle.trajectory import Trajectory
 
 _PART = 0.04  # s of a part of a tube
-_WAITS = -10.0  # s, long before its start: a vehicle that is lost then hovers until it falls
+_BEFORE_START = -10.0  # s: a vehicle that is lost then hovers until it falls
+_LEAD = 0.08  # m, about, by which polynomials lead their plan; assumed until they are fitted
 
 
 def prepare_fleet_on_board(
@@ -58,13 +61,17 @@ def prepare_fleet_on_board(
     """
     require_watchdog(limits)
     fleet, gentle = load_fleet(source, on_step), limits_for_polynomials(limits)
+    fleet = replace(fleet, skew=fleet.skew + OBEYS_LATE)
 
-    def slower_for_fall(plan: Plan) -> Plan:
+    def slower_for_fall(plan: Plan, on_step: OnStep = ignore_steps) -> Plan:
         if limits.link_loss.only_warn:
             return plan
-        return replace(give_way_to_fall(PlannedFlight("", plan, limits)).plan, limits=plan.limits)
+        return replace(give_way_to_fall(PlannedFlight("", plan, limits), on_step).plan, limits=plan.limits)
 
-    alone = [replace(each, plan=slower_for_fall(each.plan)) for each in plan_alone(fleet, gentle, options, on_step)]
+    alone = [
+        replace(each, plan=slower_for_fall(each.plan, steps_of(each.name, on_step)))
+        for each in plan_alone(fleet, gentle, options, on_step)
+    ]
     model = _loss_model(fleet, limits, once_per_plan(_stops_of_plan))
     planned = replace(coordinate_fleet(fleet, alone, gentle, model, on_step, slower_for_fall), limits=limits)
 
@@ -89,8 +96,9 @@ def _loss_model(fleet: FleetFile, limits: Limits, stops: Callable[[Plan], Stops]
     deviation = allowed_deviation(fleet.apart)
 
     def tube(plan: Plan) -> Tube:
-        times = np.append(_WAITS, _setpoints(plan.trajectory))
-        return Tube(fall_tubes(plan.trajectory, times, limits, deviation, _PART), RATE, _PART, begins=1)
+        times = np.append(_BEFORE_START, _setpoints(plan.trajectory))
+        boxes = fall_tubes(plan.trajectory, times, limits, deviation=deviation, part=_PART, back=BACK)
+        return Tube(boxes, RATE, _PART, first=1)
 
     together = tuple(fleet.dongles.values())
     return LossModel(once_per_plan(tube), stops, together, lost_clearance(fleet.apart))
@@ -101,19 +109,21 @@ def _setpoints(trajectory: Trajectory) -> np.ndarray:
 
 
 def _stops_of_plan(plan: Plan) -> Stops:
-    """Return the stops by go-to from a plan, about as its polynomials will make them."""
+    """Return the stops by go-to from a plan, which approximate those from its polynomials."""
     state = plan.trajectory.at(_setpoints(plan.trajectory))
     begin = np.zeros((len(state.position), 3, 4))
     begin[:, :, :3] = np.stack([state.position, state.velocity, state.acceleration], axis=1)
     states = go_to_states(begin, stop_targets(begin), STOP_DURATION, round(STOP_DURATION * RATE) + 1)
-    return _stops(states[:, :, 0, :2])
+    return _stops(states[:, :, 0, :2], _LEAD)
 
 
 def _stops_of_program(prepared: PreparedOnBoard) -> Stops:
-    rows = prepared.mission.stops
-    return _stops(decode(rows.reshape(-1, PAYLOAD_SIZE)).position[:, :2].reshape(*rows.shape[:2], 2))
+    rows, trajectory = prepared.mission.stops, prepared.plan.trajectory
+    places = decode(rows.reshape(-1, PAYLOAD_SIZE)).position[:, :2].reshape(*rows.shape[:2], 2)
+    planned = trajectory.path(trajectory.s_at(np.arange(len(places)) / RATE))[:, :2]
+    return _stops(places, float(np.linalg.norm(places[:, 0] - planned, axis=1).max()))
 
 
-def _stops(places: np.ndarray) -> Stops:
+def _stops(places: np.ndarray, off: float) -> Stops:
     moved = np.linalg.norm(np.diff(places, axis=1), axis=2).max(), np.linalg.norm(np.diff(places, axis=0), axis=2).max()
-    return Stops(np.ascontiguousarray(places), RATE, RATE * float(max(moved)))
+    return Stops(np.ascontiguousarray(places), RATE, RATE * float(max(moved)), off)

@@ -31,7 +31,7 @@ from cfplan.simulation.dry_run import DryRun
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
 from cfplan.vehicle.airframe import GRAVITY
 
-Made = TypeVar("Made")
+T = TypeVar("T")
 _TUBE_NEARER = 0.10  # m less than `apart` that others keep from a tube, which encloses the deviation of its vehicle
 _BLIND = 2.0  # s, about, in which a vehicle without poses brakes and comes down; after 3 s its motors stop
 _CEILING = FLOOR + 3  # its number among the faces
@@ -76,7 +76,7 @@ class PlannedFleet:
                 " – ".join(each.pair),
                 f"{each.distance:.3f} m",
                 f"{self.apart:.3f} m",
-                f"{each.time:.2f} s",
+                f"{each.time:.2f} s{', braking' if each.braked else ''}",
                 f"{each.place[0]:.2f}, {each.place[1]:.2f}",
             )
             for each in self.separations
@@ -114,7 +114,13 @@ class PlannedFleet:
             "slowest_alone": self.alone,
             "vehicles": [flight.to_dict() | {"starts": each.delay, "ends": each.end} for each, flight in vehicles],
             "pairs": [
-                {"pair": each.pair, "distance": each.distance, "place": each.place, "time": each.time}
+                {
+                    "pair": each.pair,
+                    "distance": each.distance,
+                    "place": each.place,
+                    "time": each.time,
+                    "braking": each.braked,
+                }
                 for each in self.separations
             ],
             "lost": [asdict(each) for each in self.losses],
@@ -214,15 +220,18 @@ def certify_separation(
         found = separations(members, fleet.skew)
         if stops is not None:
             braked = stop_separations(members, [stops(member.plan) for member in members], fleet.skew)
-            both = sorted((*found, *braked), key=lambda each: each.distance)
-            found = tuple({each.pair: each for each in reversed(both)}.values())[::-1]
+            nearest: dict[tuple[str, str], Separation] = {}
+            for each in sorted((*found, *braked), key=lambda each: each.distance):
+                nearest.setdefault(each.pair, each)
+            found = tuple(nearest.values())
         results.append(f"nearest {found[0]}")
-        if not found[0].keeps(fleet.apart):
-            raise NotCertifiedError(
-                f"{found[0]}; they must keep {fleet.apart:g} m",
-                where=fleet.name,
-                hint="plan the fleet again, or move a path",
-            )
+        for each in found:
+            if not each.keeps(fleet.apart):
+                raise NotCertifiedError(
+                    f"{each}; they must keep {fleet.apart:g} m",
+                    where=fleet.name,
+                    hint="plan the fleet again, or move a path",
+                )
     return found
 
 
@@ -232,11 +241,11 @@ def certify_losses(
     """Return the worst moments to lose a vehicle. Raises InfeasibleError if they do not pass, unless it only warns."""
     with step(on_step, "lost vehicles") as results:
         losses = model.losses(members, range(len(members)), fleet.skew)
-        avoids_lost = losses[0].keeps(model.clearance)
+        avoids_lost = all(each.keeps(model.clearance) for each in losses)
         (results.append if avoids_lost else results.warn)(str(losses[0]))
         if not avoids_lost and not fleet.lost_only_warns:
             raise InfeasibleError(
-                f"no start delays and clock rates keep {model.clearance:.2f} m from a lost vehicle: {losses[0]}",
+                f"the others do not keep {model.clearance:.2f} m from a lost vehicle: {losses[0]}",
                 where=fleet.name,
                 hint=_LOST_HINT if len(losses[0].vehicles) == 1 else f"give each vehicle its own dongle, {_LOST_HINT}",
             )
@@ -293,11 +302,11 @@ def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
     return LossModel(once_per_plan(tube), stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))
 
 
-def once_per_plan(make: Callable[[Plan], Made]) -> Callable[[Plan], Made]:
+def once_per_plan(make: Callable[[Plan], T]) -> Callable[[Plan], T]:
     """Return a function that makes something of each plan, once."""
-    known: dict[int, tuple[Plan, Made]] = {}  # the plan too, as its id is free once it is gone
+    known: dict[int, tuple[Plan, T]] = {}  # the plan too, as its id is free once it is gone
 
-    def made(plan: Plan) -> Made:
+    def made(plan: Plan) -> T:
         if id(plan) not in known:
             known[id(plan)] = plan, make(plan)
         return known[id(plan)][1]

@@ -130,6 +130,7 @@ def test_polynomials_of_a_fleet_that_are_started_together_keep_apart(export, for
         assert written["file"] == str(folder / vehicle["name"]) + (".csv" if form == "crazyswarm" else ".bin")
         assert written["certificate"]["passed"]
         assert written["compressed"] == (form == "compressed")
+        assert 1.0 <= written["slowing"] < 1.2
         assert written["duration"] > vehicle["ends"]
         if form == "crazyswarm":
             flown.append(places_of_crazyswarm(written["file"], times))
@@ -169,13 +170,22 @@ def test_no_folder_is_made_for_a_fleet_that_is_refused(cfplan, narrow_fleet, saf
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("name", ["../a", "a/b", ".a"])
+def test_a_vehicle_whose_name_is_no_file_name_is_refused(cfplan, fleet_file, safety_file, tmp_path, name):
+    fleet_file.write_text(LINES.replace("  a:", f"  {name}:"))
+    ended = cfplan("export", fleet_file, "--safety", safety_file(), "--to", "samples", "-o", tmp_path / "out")
+    assert ended.code == 2
+    assert name in ended.err
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("command", "words", "what"),
     [
         ("plan", ["-o", "a.parquet"], "plan files are not supported"),
         ("fly", ["--records", ".", "--live"], "do not fly with --live"),
         ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "do not fly with --uri"),
-        ("export", ["--to", "samples", "-o", "out.csv"], "a folder with a file per vehicle"),
+        ("export", ["--to", "memory", "--pieces", "40", "-o", "out"], "holds 31 pieces"),
         ("export", ["--to", "memory", "-o", "line.yaml"], "this is a file"),
         ("export", ["--to", "memory", "-o", "."], "the folder already exists"),
     ],

@@ -3,15 +3,23 @@
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from cfplan.errors import NotCertifiedError
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
-from cfplan.planning.fleet.separation import CLEAR, separations
+from cfplan.planning.fleet.separation import CLEAR, Stops, separations
 from cfplan.planning.plan import plan
-from cfplan.preparation.plan_fleet import PlannedFleet, coordinate_fleet, loss_model, prepare_fleet, rehearse_fleet
+from cfplan.preparation.plan_fleet import (
+    PlannedFleet,
+    certify_separation,
+    coordinate_fleet,
+    loss_model,
+    prepare_fleet,
+    rehearse_fleet,
+)
 from cfplan.preparation.plan_flight import PlannedFlight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.preparation.steps import StepState
@@ -54,6 +62,30 @@ def test_a_fleet_whose_vehicles_deviate_more_than_allowed_is_refused_with_the_di
     needed = float(re.search(r"apart: ([\d.]+)", refused.value.hint)[1])
     assert needed - 0.01 < CLEAR + 2.0 * deviation <= needed
     assert rehearsed(replace(narrow, apart=needed))
+
+
+def stops_towards(y: float, by: float) -> Stops:
+    """Stops from y towards larger y, across lines along x, for the certificate alone."""
+    places = np.zeros((200, 11, 2))
+    places[..., 0] = np.linspace(-0.6, 0.6, 200)[:, None]
+    places[..., 1] = y + np.linspace(0.0, by, 11)
+    return Stops(places, 100.0, 0.0, 0.0)
+
+
+def test_each_pair_must_keep_apart_on_its_paths_and_in_its_stops(limits):
+    """The pair that is nearest in its stops is not the one that is nearest on its paths."""
+    lines = {y: plan(min_snap([[-0.6, y, 1.0], [0.6, y, 1.0]]), limits.airframe, limits) for y in (0.0, 1.0, 1.5)}
+    members = [FleetMember(f"at {y:g}", planned) for y, planned in lines.items()]
+    stops = {0.0: stops_towards(0.0, 0.7), 1.0: stops_towards(1.0, 0.05), 1.5: stops_towards(1.5, 0.0)}
+    of_plan = {id(planned): stops[y] for y, planned in lines.items()}
+    fleet = FleetFile("row", (), 0.25, SKEW)
+    found = certify_separation(fleet, members, lambda planned: of_plan[id(planned)])
+    assert [(each.pair, each.braked) for each in found] == [
+        (("at 0", "at 1"), True), (("at 1", "at 1.5"), True), (("at 0", "at 1.5"), True),
+    ]  # fmt: skip
+    assert [each.distance for each in found] == pytest.approx([0.3, 0.45, 0.8], abs=0.06)
+    with pytest.raises(NotCertifiedError, match=r"at 0 and at 1 .*when all brake"):
+        certify_separation(replace(fleet, apart=0.35), members, lambda planned: of_plan[id(planned)])
 
 
 @pytest.fixture(scope="module")

@@ -27,7 +27,7 @@ import numpy as np
 
 from cfplan.errors import ExitCode
 from cfplan.flight.pilot.conducted import ClearanceAsked, ConductorMessage, PilotMessage, PlanLeft
-from cfplan.flight.setpoints.encoding import LEAD
+from cfplan.flight.setpoints.encoding import LEAD, RATE
 from cfplan.flight.telemetry import (
     Estimate,
     Event,
@@ -50,6 +50,7 @@ PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehi
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
+OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
 _OLD = 0.2  # s; the pilot of a vehicle without a newer pose brakes by itself
@@ -185,8 +186,11 @@ class Conductor:
                 allowed = allowed_deviation(self._apart) + OFF_BY_MORE
                 if not (off := vehicle.deviation) <= allowed:
                     self._brake(f"{name}: it is {off:.2f} m beside its place, at most {allowed:.2f} m")
-            case SetpointSent():
+            case SetpointSent(time=time, index=index):
                 vehicle.setpoints.append(message)
+                late = time - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
+                if vehicle.phase is Phase.STREAM and late > START_LATE + OBEYS_LATE and not vehicle.left:
+                    self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE + OBEYS_LATE:g} s")
             case PhaseEntered(time=began, phase=phase):
                 if phase is Phase.STREAM and (late := began - vehicle.cleared.get(phase, -math.inf)) > START_LATE:
                     self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE:g} s")

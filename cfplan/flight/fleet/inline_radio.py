@@ -15,7 +15,7 @@ from cfplan.flight.radio.session import PING_PERIOD
 from cfplan.flight.setpoints.encoding import RATE
 
 PACKETS_PER_VEHICLE = RATE + RATE + 1.0 / PING_PERIOD  # a second: setpoints, poses and pings
-PACKETS_ON_BOARD = RATE + 2.0 / PING_PERIOD  # a second: poses, pings and as many keep-alive packets
+PACKETS_ON_BOARD = RATE + 2.0 / PING_PERIOD  # a second: poses, pings and keep-alive packets, the last two alike
 USABLE_FRACTION = 0.75  # of a dongle's capacity; the rest is for repetitions and for packets that vehicles send
 _INLINE_SINCE = 0x0501  # firmware version of a Crazyradio 2.0, as in its USB descriptor
 _SERIAL_DIGITS = 10  # of the serial number of a dongle, whose place in the list has fewer
@@ -53,14 +53,14 @@ def require_capacity(
 ) -> str:
     """Return a message with the packets that the vehicles need and the dongle carries; raise InputError if too few.
 
-    Each vehicle needs as many `packets` a second.
+    `packets` is the rate that each vehicle needs, 1/s.
     """
     need, most = packets * len(vehicles), int(mode.usable / packets)
     if need <= mode.usable:
         return f"{len(vehicles)} vehicles need {need:.0f} packets a second, and {mode.name} carries {mode.usable:.0f}"
     cure = "plug in more dongles, and number them 0, 1, … after radio://"
     if packets > PACKETS_ON_BOARD and PACKETS_ON_BOARD * len(vehicles) <= mode.usable:
-        cure += "; or fly with --on-board, which streams poses alone"
+        cure += "; or fly with --on-board, which streams only poses"
     if mode is USB_SET_UP:
         cure += "; or use a Crazyradio 2.0 with firmware 5.1 or newer, which has inline mode"
     raise InputError(

@@ -9,6 +9,7 @@ f = a + g decays; so from the state p, v, a
 down to the floor, for no lag and for the longest one. Drag, which would slow the vehicle, is neglected.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.flight.firmware import Timeouts, estimate_errors
+from cfplan.flight.on_board.go_to import stop_targets
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES
 from cfplan.vehicle.airframe import GRAVITY
@@ -25,8 +27,8 @@ _LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; number of moments compute
 _PARTS = tuple(slice(begin, begin + 9) for begin in range(0, _MOMENTS - 1, 8))
 """Moments of each part of a fall; with obstacles each part has its own box. Neighbouring parts share a moment."""
 _G = np.array([0.0, 0.0, GRAVITY])
-_KEEP_ALIVE_PERIOD = 0.1  # s: so long before its link died the last keep-alive packet may have arrived
-_CUTS = 4  # moments within what that leaves open at which the watchdog stops the motors, in tubes
+_KEEP_ALIVE_AGE = 0.12  # s; the last keep-alive packet may be this old when the link dies: 0.1 s and two ticks
+_WATCHDOG_SAMPLES = 4  # of the times at which the watchdog may stop the motors, in a tube
 _TUBE_STEP = 0.02  # s between the moments of a tube
 
 
@@ -54,14 +56,8 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
     time, floor = np.linspace(0.0, _LONGEST, _MOMENTS), limits.space.low[2]
     boxes = np.empty((len(states), len(_PARTS) if limits.space.obstacles else 1, 2, 3))
     boxes[:, :, 0], boxes[:, :, 1] = np.inf, -np.inf
-    for lag in (0.0, max(*limits.link_loss.motor_lags, limits.airframe.motor_time_constant)):
-        pushed = lag * (time - lag * -np.expm1(-time / lag)) if lag else np.zeros_like(time)
-        place = (
-            position[:, None]
-            + time[:, None] * velocity[:, None]
-            - (0.5 * time**2)[:, None] * _G
-            + pushed[:, None] * (acceleration + _G)[:, None]
-        )  # (N, moments, 3)
+    for lag in (0.0, _longest_lag(limits)):
+        place = _fallen(position, velocity, acceleration, time, lag)
         in_air = np.concatenate([np.ones((len(states), 1), bool), place[:, :-1, 2] > floor], axis=1)[..., None]
         aside, up = _astray(limits, time, Timeouts().watchdog_at_latest)
         spread = np.stack([aside + deviation, aside + deviation, up + deviation + 0.0 * time], axis=1)
@@ -82,16 +78,19 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
     return Falls(beyond, face, reach, distance)
 
 
-def fall_tubes(trajectory: Trajectory, times: NDArray, limits: Limits, deviation: float, part: float) -> NDArray:
+def fall_tubes(
+    trajectory: Trajectory, times: NDArray, limits: Limits, *, deviation: float, part: float, back: float
+) -> NDArray:
     """Lose a vehicle at each time, (R,) s, of a trajectory that it flies on board.
 
     Returns boxes, (2, R, S, 2, 3) m: low and high corners of the space that the vehicle is in during each `part`, s,
-    from that time on, first if its motors stop at once, then if its link dies and the watchdog stops them. They enclose
-    falls without lag and with the longest one, and a vehicle within `deviation`, m, of the trajectory before. In the
-    last part it lies on the floor.
+    from that time on, with heights above the floor. In the first its motors stop at once; in its last part it lies on
+    the floor. In the second its link dies, and either the watchdog stops the motors, or the link is back after `back`,
+    s, or more, and it flies to a stop that the pilot has ordered meanwhile, where it may hover. They enclose falls
+    without lag and with the longest one, and a vehicle within `deviation`, m, of the trajectory before.
     """
     timeouts = Timeouts()
-    watchdog = np.linspace(timeouts.keep_alive - _KEEP_ALIVE_PERIOD, timeouts.watchdog_at_latest, _CUTS)
+    watchdog = np.linspace(timeouts.keep_alive - _KEEP_ALIVE_AGE, timeouts.watchdog_at_latest, _WATCHDOG_SAMPLES)
     stride = round(part / _TUBE_STEP)
     parts = math.ceil((watchdog[-1] + _LONGEST) / part)
     moments = _TUBE_STEP * np.arange(parts * stride + 1)
@@ -100,44 +99,74 @@ def fall_tubes(trajectory: Trajectory, times: NDArray, limits: Limits, deviation
     tubes = np.empty((2, len(times), parts, 2, 3))
     for way, cuts in enumerate((np.zeros(1), watchdog)):
         low, high = np.full((len(times), len(moments), 3), np.inf), np.full((len(times), len(moments), 3), -np.inf)
-        for cut in cuts:
-            for lag in (0.0, max(*limits.link_loss.motor_lags, limits.airframe.motor_time_constant)):
-                place, spread = _falling(trajectory, times, flown, moments, cut=float(cut), lag=lag, limits=limits)
-                spread[..., :2] += deviation
-                low, high = np.minimum(low, place - spread), np.maximum(high, place + spread)
+        for cut, lag, rises in itertools.product(cuts, (0.0, _longest_lag(limits)), (-1.0, 1.0)):
+            place, aside = _falling(
+                trajectory, times, flown, moments, cut=cut, lag=lag, rises=rises, deviation=deviation, limits=limits
+            )
+            aside = np.stack([aside, aside, np.zeros_like(aside)], axis=2)
+            low, high = np.minimum(low, place - aside), np.maximum(high, place + aside)
         for number in range(parts):
             within = slice(number * stride, (number + 1) * stride + 1)
             tubes[way, :, number, 0], tubes[way, :, number, 1] = low[:, within].min(axis=1), high[:, within].max(axis=1)
+    _enclose_stops(tubes[1, :, int(back / part) :], trajectory, times, limits, deviation, back)
+    tubes[..., 2] -= limits.space.low[2]
     return tubes
 
 
-def _falling(
-    trajectory: Trajectory, times: NDArray, flown: NDArray, moments: NDArray, *, cut: float, lag: float, limits: Limits
-) -> tuple[NDArray, NDArray]:
-    """Return where a vehicle is whose motors stop `cut`, s, after each time, and how far astray: both (R, M, 3) m.
+def _enclose_stops(
+    boxes: NDArray, trajectory: Trajectory, times: NDArray, limits: Limits, deviation: float, back: float
+) -> None:
+    """Let boxes, (R, P, 2, 3) m, enclose the ways to stops that begin `back`, s, after each time or later."""
+    latest = Timeouts().watchdog_at_latest
+    aside = float(_astray(limits, np.zeros(1), latest)[0][0]) + deviation
+    for later in np.linspace(back, latest, math.ceil((latest - back) / _TUBE_STEP) + 1):
+        state = trajectory.at(times + later)
+        begin = np.zeros((len(times), 3, 4))
+        begin[:, :, :3] = np.stack([state.position, state.velocity, state.acceleration], axis=1)
+        for place in (state.position, stop_targets(begin)[:, :3]):
+            boxes[:, :, 0, :2] = np.minimum(boxes[:, :, 0, :2], place[:, None, :2] - aside)
+            boxes[:, :, 1, :2] = np.maximum(boxes[:, :, 1, :2], place[:, None, :2] + aside)
+            boxes[:, :, 1, 2] = np.maximum(boxes[:, :, 1, 2], place[:, None, 2])
 
-    `flown`, (R, F, 3) m, is the trajectory at the first F of the moments, (M,) s. On the floor it stays where it is.
+
+def _longest_lag(limits: Limits) -> float:
+    return max(*limits.link_loss.motor_lags, limits.airframe.motor_time_constant)
+
+
+def _falling(
+    trajectory: Trajectory, times: NDArray, flown: NDArray, moments: NDArray, *, cut: float, lag: float, rises: float,
+    deviation: float, limits: Limits,
+) -> tuple[NDArray, NDArray]:  # fmt: skip
+    """Return where a vehicle is whose motors stop `cut`, s, after each time, (R, M, 3) m; and how far astray, (R, M) m.
+
+    `flown`, (R, F, 3) m, is the trajectory at the first F of the moments, (M,) s. The vehicle is higher by `rises`, -1
+    to 1, times the deviation, m, and what the error of its vertical acceleration makes. On the floor it stays.
     """
-    state, after = trajectory.at(times + cut), np.maximum(moments - cut, 0.0)
-    pushed = lag * (after - lag * -np.expm1(-after / lag)) if lag else np.zeros_like(after)
-    place = (
-        state.position[:, None]
-        + after[:, None] * state.velocity[:, None]
-        - (0.5 * after**2)[:, None] * _G
-        + pushed[:, None] * (state.acceleration + _G)[:, None]
-    )
+    after, blind = np.maximum(moments - cut, 0.0), np.minimum(moments, cut)
+    state = trajectory.at(times + cut)
+    place = _fallen(state.position, state.velocity, state.acceleration, after, lag)
     flies = moments <= cut
     place[:, flies] = flown[:, : np.count_nonzero(flies)]
-    aside, up = _astray(limits, after, np.minimum(moments, cut))
-    spread = np.broadcast_to(np.stack([aside, aside, up], axis=1), place.shape)
+    climb = limits.link_loss.vertical_acceleration_error * (0.5 * blind**2 + blind * after)
+    place[..., 2] += rises * (deviation + climb)
+    aside = np.broadcast_to(deviation + _astray(limits, after, blind)[0], place.shape[:2])
     lies = (place[..., 2] <= limits.space.low[2]) & ~flies
     touches = np.where(lies.any(axis=1), lies.argmax(axis=1), len(moments) - 1)
-    rows = np.arange(len(times))[:, None]
-    there = np.minimum(np.arange(len(moments)), touches[:, None])
-    place, spread = place[rows, there], spread[rows, there].copy()
-    down = np.arange(len(moments)) >= touches[:, None]
-    place[down, 2], spread[down, 2] = limits.space.low[2], 0.0
-    return place, spread
+    rows, there = np.arange(len(times))[:, None], np.minimum(np.arange(len(moments)), touches[:, None])
+    place = place[rows, there]
+    place[np.arange(len(moments)) >= touches[:, None], 2] = limits.space.low[2]
+    return place, aside[rows, there]
+
+
+def _fallen(position: NDArray, velocity: NDArray, acceleration: NDArray, time: NDArray, lag: float) -> NDArray:
+    """Return the places, (R, M, 3) m, of vehicles in states, (R, 3) each, a `time`, (M,) s, after their motors stop."""
+    pushed = lag * (time - lag * -np.expm1(-time / lag)) if lag else np.zeros_like(time)
+    return np.asarray(
+        position[:, None]
+        + time[:, None] * velocity[:, None]
+        - (0.5 * time**2)[:, None] * _G
+        + pushed[:, None] * (acceleration + _G)[:, None]
+    )
 
 
 def _astray(limits: Limits, time: NDArray, blind: NDArray | float) -> tuple[NDArray, NDArray | float]:

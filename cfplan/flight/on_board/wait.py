@@ -7,6 +7,7 @@ import numpy as np
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
 from cfplan.flight.on_board.memory_format import (
     END,
+    MOST_PIECES,
     POINTS,
     START_SIZE,
     ControlPoints,
@@ -23,7 +24,7 @@ WAIT_STEP = 0.001  # s: waits are multiples of this
 def with_wait(made: OnBoardTrajectory, wait: float) -> OnBoardTrajectory:
     """Return the trajectory with one more piece, which hovers for `wait`, s, before the others; none if that is 0.
 
-    Raises NotCertifiedError if the memory does not hold it.
+    As in the trajectory given, there are no bytes where there are more pieces than the memory holds.
     """
     if wait == 0.0:
         return made
@@ -35,4 +36,5 @@ def with_wait(made: OnBoardTrajectory, wait: float) -> OnBoardTrajectory:
     coefficients = np.zeros((1, AXES, COUNT))
     coefficients[0, :, 0] = made.pieces.coefficients[0, :, 0]
     pieces = Pieces(np.append([wait], made.pieces.durations), np.concatenate([coefficients, made.pieces.coefficients]))
-    return replace(made, memory=raw_bytes(pieces) if made.memory else b"", pieces=pieces)
+    fits = len(pieces.durations) <= MOST_PIECES
+    return replace(made, memory=raw_bytes(pieces) if fits else b"", pieces=pieces)

@@ -32,7 +32,7 @@ from cfplan.vehicle.trajectory import Trajectory
 ORDERS = 60  # that are tried, at most
 MADE = 12  # of these, whose plans are slowed and compared; the soonest first
 SLACKS = (0.02, 0.05, 0.1)  # m added to the distance in the search, tried until the certificate passes
-_OFF_PATH_SLACKS = (0.2, 0.35)  # m, more of these, for vehicles that leave their paths to stop
+_OFF_PATH_SLACKS = (0.2, 0.35)  # m, tried in addition for vehicles that leave their paths to stop
 _BETWEEN_SKEWS = 0.03  # s, largest spacing within the skew in the search
 _LEAST_SPEED = 0.05  # m/s, of caps
 _PLACES = 0.02  # s of a plan between the places of its caps

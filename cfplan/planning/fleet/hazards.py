@@ -17,7 +17,8 @@ from cfplan.planning.fleet.members import FleetMember
 
 STRIDE = 3 * TICK  # s of a plan's own time, from one row of a map to the next
 _FAR = 0.2  # m beyond the clearance, from which on a distance does not matter
-BEFORE = 2.4  # s before a start, from which on the start does not matter: a tube lasts no longer
+_MOST_SLACK = 0.1  # m, less than _FAR, as distances beyond that are not known
+BEFORE = 2.4  # s before a start, from which on the start hardly matters
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,8 @@ class Hazards:
         `others`, (T,) s, are own times of the second at each tick, negative before its start.
         """
         found = self.maps[pair]
-        near = ~(found >= self.clearance + slack)[:, np.clip(_row(others), 0, found.shape[1] - 1)]  # (rows, T)
+        is_near = ~(found >= self.clearance + min(slack, _MOST_SLACK))
+        near = is_near[:, np.clip(_row(others), 0, found.shape[1] - 1)]  # (rows, T)
         cells = np.clip(_row(CELL * np.arange(hazard.shape[1])), 0, len(found) - 1)
         hazard[:, 1:] |= near[cells[1:]].T
         hazard[:, 0] |= near[0]

@@ -46,11 +46,11 @@ class Tube(NamedTuple):
     boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways, a lost link the last
     rate: float  # Hz, of the R setpoints
     part: float  # s of each part; the last one, in which it lies, lasts
-    begins: int = 0  # row of the plan's first setpoint; those before it are of a vehicle that still waits
+    first: int = 0  # row of the plan's first setpoint; those before it are of a vehicle that still waits
 
     def rows(self, own: NDArray) -> NDArray:
         """Return the rows at own times of the plan, (N,) s: before its start the first one."""
-        return np.clip(np.round(own * self.rate) + self.begins, 0, self.boxes.shape[1] - 1).astype(np.int64)
+        return np.clip(np.round(own * self.rate) + self.first, 0, self.boxes.shape[1] - 1).astype(np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,9 @@ class LossModel:
         `numbers` are those of the members in the fleet. Clocks and orders differ by `skew`, s, at most.
         """
         tubes, count = [self.tube(member.plan) for member in members], len(members)
-        times = np.arange(0, int(np.ceil(max(member.end for member in members) * tubes[0].rate)) + 1) / tubes[0].rate
+        rate, end = tubes[0].rate, max(member.end for member in members)
+        before = int(np.ceil((NOTICED[1] + skew) * rate)) if tubes[0].first else 0  # else the first setpoint is a hover
+        times = np.arange(-before, int(np.ceil(end * rate)) + 1) / rate
         own = [times - member.delay for member in members]
         away = np.full((count, count, len(times)), np.inf)  # lost, other, time
         for i, j in itertools.permutations(range(count), 2):
@@ -253,9 +255,9 @@ def _off_path(tube: Tube, lost: NDArray, stops: Stops, own: NDArray, skew: float
     rows = np.round(np.clip(own, -_RESTS, _RESTS) * stops.rate).astype(np.int64)
     found = _least_off_path(
         tube.boxes, tube.rows(lost), stops.places, rows, begins.astype(np.int64), window.astype(np.int64),
-        tube.part * stops.rate, far,
+        tube.part * stops.rate, far + stops.error,
     )  # fmt: skip
-    return np.asarray(found - stops.between)
+    return np.asarray(found - stops.error)
 
 
 @njit(nogil=True, error_model="numpy")

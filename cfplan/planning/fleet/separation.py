@@ -52,11 +52,12 @@ class Stops(NamedTuple):
     places: NDArray  # (R, M, 2) m, x and y, of a stop from each of R setpoints; the first is that of the setpoint
     rate: float  # Hz, of setpoints and of the places of a stop
     speed: float  # m/s, at most
+    off: float  # m, at most, from the place of a setpoint to that of the plan
 
     @property
-    def between(self) -> float:
+    def error(self) -> float:
         """Return how far, m, the vehicle may be from the nearest of the places."""
-        return self.speed / self.rate + _BETWEEN
+        return self.speed / self.rate + self.off + _BETWEEN
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class Separation:
     distance: float  # m, lower bound, including between samples and over the skew
     place: tuple[float, float]  # m, x and y, in the middle between them
     time: float  # s after the fleet's start
-    braked: bool = False  # whether it is after all have begun to brake at that time, off their paths
+    braked: bool = False  # whether all begin to brake at that time, and come this near as they stop off their paths
 
     def __str__(self) -> str:
         a, b = self.pair
@@ -120,7 +121,7 @@ def stop_separations(members: Sequence[FleetMember], stops: Sequence[Stops], ske
         rows = [np.round(times - rate * members[n].delay).astype(np.int64) for n in (i, j)]
         least, time, place, other = _nearest_stops(a.places, rows[0], b.places, rows[1], int(np.ceil(skew * rate)) + 1)
         x, y = (0.5 * (np.array(place) + np.array(other))).tolist()
-        distance = max(float(least) - a.between - b.between, 0.0)
+        distance = max(float(least) - a.error - b.error, 0.0)
         found.append(Separation((members[i].name, members[j].name), distance, (x, y), time / rate, braked=True))
     return tuple(sorted(found, key=lambda each: each.distance))
 

@@ -79,8 +79,8 @@ def cleared(said, phase):
     return {name for name, message in said.items() if phase in message.cleared}
 
 
-def setpoint(time, position):
-    return SetpointSent(time, time, 0, position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
+def setpoint(time, position, index=0):
+    return SetpointSent(time, time, index, position, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), LEVEL, (0.0, 0.0, 0.0))
 
 
 def braking(said):
@@ -156,6 +156,20 @@ def test_all_brake_when_one_begins_late(late, brakes):
     fleet.go_on(1.3)
     fleet.hear("right", PhaseEntered(begins + late, Phase.STREAM))
     assert bool(braking(fleet.go_on(0.01))) is brakes
+
+
+@pytest.mark.parametrize(("again", "brakes"), [(0.0, False), (0.3, True)])
+def test_all_brake_when_a_vehicle_on_board_must_be_told_again_to_begin(again, brakes):
+    """Its plan begins anew with each command, so it is not off its path."""
+    fleet = Fleet()
+    begins = fleet.fly()["right"].cleared[Phase.STREAM]
+    fleet.go_on(1.2)
+    fleet.hear("right", PhaseEntered(begins + 0.005, Phase.STREAM))
+    for index in range(5):
+        fleet.hear("right", setpoint(begins + 0.03 + again + 0.01 * index, (0.5, 0.0, 0.6), index))
+    said = fleet.go_on(0.01)
+    assert bool(braking(said)) is brakes
+    assert ("right: it began 0.33 s late" in said["left"].brakes) is brakes
 
 
 def test_a_pilot_that_hears_of_its_start_too_late_has_braked_before():

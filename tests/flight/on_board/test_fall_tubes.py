@@ -1,5 +1,6 @@
 """Tubes of vehicles that are lost while they fly on board, against falls integrated step by step."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from cfplan.planning.plan import plan
 from cfplan.safety.limits_file import load_limits
 
 REPOSITORY = Path(__file__).parents[3]
-GRAVITY, STEP, PART, DEVIATION = 9.81, 0.001, 0.04, 0.05
+GRAVITY, STEP, PART, DEVIATION, BACK = 9.81, 0.001, 0.04, 0.05, 0.4
 TIMES = np.arange(0.0, 2.6, 0.2)
 
 
@@ -30,18 +31,20 @@ def trajectory(safety):
 
 @pytest.fixture(scope="module")
 def tubes(trajectory, safety):
-    return fall_tubes(trajectory, TIMES, safety, DEVIATION, PART)
+    return fall_tubes(trajectory, TIMES, safety, deviation=DEVIATION, part=PART, back=BACK)
 
 
 def fall(trajectory, begin, cut, safety, chance):
     """The places, (N, 3) m every STEP, of a vehicle whose motors stop `cut` s after `begin`, by Euler's method.
 
-    It leaves its trajectory by constant errors: of its tilt, which pushes it, and of its velocity.
+    It leaves its trajectory by constant errors: of its tilt, which pushes it, of its velocity, and of its vertical
+    acceleration.
     """
     tilt, slip = (error * chance.uniform() for error in estimate_errors(safety))
     aside, along = chance.uniform(0.0, 2.0 * np.pi, 2)
     lag = chance.uniform(0.01, max(*safety.link_loss.motor_lags))
     push = GRAVITY * np.tan(tilt) * np.array([np.cos(aside), np.sin(aside), 0.0])
+    push[2] = chance.uniform(-1.0, 1.0) * safety.link_loss.vertical_acceleration_error
     drift = slip * np.array([np.cos(along), np.sin(along), 0.0])
     places, offset = [], np.zeros(3)
     for n in range(round(cut / STEP)):
@@ -70,9 +73,21 @@ def test_a_vehicle_that_falls_is_in_its_tube_at_each_time_until_it_lies(way, tra
             assert inside.min() > 0.0
             nearest = min(nearest, inside.min())
             touched = parts[-1]
-            assert (tubes[way, row, : max(touched - 1, 1), 1, 2] > 0.0).all()  # in the air, as this one is
+            assert (tubes[way, row, : max(touched, 1), 1, 2] > 0.0).all()  # in the air, as this one is
     assert nearest < DEVIATION + 0.03  # the tube is not much wider than these
 
 
-def test_in_the_last_part_it_lies_on_the_floor(tubes, safety):
-    assert (tubes[:, :, -1, 1, 2] == safety.space.low[2]).all()
+def test_a_vehicle_whose_motors_stop_lies_on_the_floor_in_the_last_part(tubes):
+    assert (tubes[0, :, -1, 1, 2] == 0.0).all()
+
+
+def test_a_vehicle_whose_link_comes_back_hovers_in_its_tube(trajectory, tubes):
+    """It brakes as the commander does: to half a second ahead at its speed, and 5/56 of its acceleration."""
+    for row, later in itertools.product(range(len(TIMES)), (BACK, 0.7, Timeouts().watchdog_at_latest)):
+        state = trajectory.at(TIMES[row] + later)
+        stop = state.position + 0.5 * state.velocity + 5.0 / 56.0 * state.acceleration
+        for place in (state.position, stop):
+            low, high = tubes[1, row, -1, :, :2]
+            assert (low + DEVIATION < place[:2]).all()
+            assert (place[:2] < high - DEVIATION).all()
+        assert tubes[1, row, -1, 1, 2] >= stop[2]

@@ -21,7 +21,7 @@ def eastwards(y: float, turn: float, x: float = 0.0) -> Stops:
     places = np.empty((SETPOINTS, PERIODS, 2))
     places[..., 0] = x + along[:, None] + (1.0 - abs(turn)) * across
     places[..., 1] = y + turn * across
-    return Stops(places, RATE, 1.0)
+    return Stops(places, RATE, 1.0, 0.0)
 
 
 def member(name: str, delay: float = 0.0):
