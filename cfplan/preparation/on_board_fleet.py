@@ -19,7 +19,7 @@ from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, stop_targe
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
 from cfplan.planning.fleet.fleet_file import FleetFile
-from cfplan.planning.fleet.lost import BACK, LossModel, Tube
+from cfplan.planning.fleet.lost import BACK, NOTICED, LossModel, Tube
 from cfplan.planning.fleet.separation import Stops, allowed_deviation
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.export_fleet import fit_fleet
@@ -97,7 +97,7 @@ def _loss_model(fleet: FleetFile, limits: Limits, stops: Callable[[Plan], Stops]
 
     def tube(plan: Plan) -> Tube:
         times = np.append(_BEFORE_START, _setpoints(plan.trajectory))
-        boxes = fall_tubes(plan.trajectory, times, limits, deviation=deviation, part=_PART, back=BACK)
+        boxes = fall_tubes(plan.trajectory, times, limits, deviation=deviation, part=_PART, stops=(BACK, NOTICED[1]))
         return Tube(boxes, RATE, _PART, first=1)
 
     together = tuple(fleet.dongles.values())

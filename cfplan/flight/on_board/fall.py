@@ -21,7 +21,7 @@ from cfplan.flight.on_board.go_to import stop_targets
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import SIDES
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.trajectory import Trajectory
+from cfplan.vehicle.trajectory import FullState, Trajectory
 
 _LONGEST, _MOMENTS = 1.6, 81  # s of a fall, from 8 m; number of moments computed
 _PARTS = tuple(slice(begin, begin + 9) for begin in range(0, _MOMENTS - 1, 8))
@@ -79,15 +79,16 @@ def falls_from(states: NDArray, limits: Limits, deviation: float) -> Falls:
 
 
 def fall_tubes(
-    trajectory: Trajectory, times: NDArray, limits: Limits, *, deviation: float, part: float, back: float
+    trajectory: Trajectory, times: NDArray, limits: Limits, *, deviation: float, part: float, stops: tuple[float, float]
 ) -> NDArray:
     """Lose a vehicle at each time, (R,) s, of a trajectory that it flies on board.
 
-    Returns boxes, (2, R, S, 2, 3) m: low and high corners of the space that the vehicle is in during each `part`, s,
-    from that time on, with heights above the floor. In the first its motors stop at once; in its last part it lies on
-    the floor. In the second its link dies, and either the watchdog stops the motors, or the link is back after `back`,
-    s, or more, and it flies to a stop that the pilot has ordered meanwhile, where it may hover. They enclose falls
-    without lag and with the longest one, and a vehicle within `deviation`, m, of the trajectory before.
+    Returns boxes, (4, R, S, 2, 3) m: low and high corners of the space that the vehicle is in during each `part`, s,
+    from that time on, with heights above the floor, in four ways: its motors stop at once, and in the last part it lies
+    on the floor; its link dies, and the link is back before the watchdog stops the motors, sooner or later, and the
+    vehicle flies to where the stop leads that the pilot has ordered meanwhile, and hovers there; the watchdog stops the
+    motors. `stops` are when, s after the loss, the pilot orders a stop at the earliest and at the latest. The boxes
+    enclose falls without lag and with the longest one, and a vehicle within `deviation`, m, of the trajectory before.
     """
     timeouts = Timeouts()
     watchdog = np.linspace(timeouts.keep_alive - _KEEP_ALIVE_AGE, timeouts.watchdog_at_latest, _WATCHDOG_SAMPLES)
@@ -96,8 +97,8 @@ def fall_tubes(
     moments = _TUBE_STEP * np.arange(parts * stride + 1)
     flies = times[:, None] + moments[moments <= watchdog[-1]]
     flown = trajectory.path(trajectory.s_at(flies.ravel())).reshape(*flies.shape, 3)
-    tubes = np.empty((2, len(times), parts, 2, 3))
-    for way, cuts in enumerate((np.zeros(1), watchdog)):
+    tubes = np.empty((4, len(times), parts, 2, 3))
+    for way, cuts in ((0, np.zeros(1)), (3, watchdog)):
         low, high = np.full((len(times), len(moments), 3), np.inf), np.full((len(times), len(moments), 3), -np.inf)
         for cut, lag, rises in itertools.product(cuts, (0.0, _longest_lag(limits)), (-1.0, 1.0)):
             place, aside = _falling(
@@ -108,25 +109,30 @@ def fall_tubes(
         for number in range(parts):
             within = slice(number * stride, (number + 1) * stride + 1)
             tubes[way, :, number, 0], tubes[way, :, number, 1] = low[:, within].min(axis=1), high[:, within].max(axis=1)
-    _enclose_stops(tubes[1, :, int(back / part) :], trajectory, times, limits, deviation, back)
+    halves = np.array_split(np.arange(stops[0], watchdog[-1] + _TUBE_STEP, _TUBE_STEP), 2)
+    ordered = np.arange(stops[0], stops[1] + _TUBE_STEP, _TUBE_STEP)
+    tubes[1:3] = tubes[3]
+    for way, back in enumerate(halves, start=1):
+        places = [trajectory.at(times + later).position for later in back]
+        if way == 2:
+            places += [_stop_from(trajectory.at(times + later)) for later in ordered]
+        _enclose(tubes[way, :, int(stops[0] / part) :], np.stack(places), limits, deviation)
     tubes[..., 2] -= limits.space.low[2]
     return tubes
 
 
-def _enclose_stops(
-    boxes: NDArray, trajectory: Trajectory, times: NDArray, limits: Limits, deviation: float, back: float
-) -> None:
-    """Let boxes, (R, P, 2, 3) m, enclose the ways to stops that begin `back`, s, after each time or later."""
-    latest = Timeouts().watchdog_at_latest
-    aside = float(_astray(limits, np.zeros(1), latest)[0][0]) + deviation
-    for later in np.linspace(back, latest, math.ceil((latest - back) / _TUBE_STEP) + 1):
-        state = trajectory.at(times + later)
-        begin = np.zeros((len(times), 3, 4))
-        begin[:, :, :3] = np.stack([state.position, state.velocity, state.acceleration], axis=1)
-        for place in (state.position, stop_targets(begin)[:, :3]):
-            boxes[:, :, 0, :2] = np.minimum(boxes[:, :, 0, :2], place[:, None, :2] - aside)
-            boxes[:, :, 1, :2] = np.maximum(boxes[:, :, 1, :2], place[:, None, :2] + aside)
-            boxes[:, :, 1, 2] = np.maximum(boxes[:, :, 1, 2], place[:, None, 2])
+def _stop_from(state: FullState) -> NDArray:
+    """Return where stops by go-to from states lead, (R, 3) m."""
+    begin = np.zeros((len(state.position), 3, 4))
+    begin[:, :, :3] = np.stack([state.position, state.velocity, state.acceleration], axis=1)
+    return stop_targets(begin)[:, :3]
+
+
+def _enclose(boxes: NDArray, places: NDArray, limits: Limits, deviation: float) -> None:
+    """Replace boxes, (R, P, 2, 3) m, by one that encloses a vehicle near all of its places, (K, R, 3) m, in the air."""
+    aside = float(_astray(limits, np.zeros(1), Timeouts().watchdog_at_latest)[0][0]) + deviation
+    spread = np.array([aside, aside, 0.0])
+    boxes[:, :, 0], boxes[:, :, 1] = places.min(axis=0)[:, None] - spread, places.max(axis=0)[:, None] + spread
 
 
 def _longest_lag(limits: Limits) -> float:

@@ -255,7 +255,7 @@ def _off_path(tube: Tube, lost: NDArray, stops: Stops, own: NDArray, skew: float
     rows = np.round(np.clip(own, -_RESTS, _RESTS) * stops.rate).astype(np.int64)
     found = _least_off_path(
         tube.boxes, tube.rows(lost), stops.places, rows, begins.astype(np.int64), window.astype(np.int64),
-        tube.part * stops.rate, far + stops.error,
+        tube.part * stops.rate, stops.speed / stops.rate, far + stops.error,
     )  # fmt: skip
     return np.asarray(found - stops.error)
 
@@ -263,13 +263,14 @@ def _off_path(tube: Tube, lost: NDArray, stops: Stops, own: NDArray, skew: float
 @njit(nogil=True, error_model="numpy")
 def _least_off_path(
     boxes: NDArray, rows: NDArray, places: NDArray, own: NDArray, begins: NDArray, window: NDArray, part: float,
-    far: float,
+    step: float, far: float,
 ) -> NDArray:  # fmt: skip
     """Return the least distances, (N,) m, of boxes to a vehicle that begins one of its stops after the loss.
 
     `places`, (R, M, 2) m, are those of the stops from each of its setpoints, of which `own`, (N,), are in force at the
     loss; `begins`, (B,), are periods until a stop begins. A part of the tube lasts `part` periods, and is compared with
-    the periods in `window` about its begin.
+    the periods in `window` about its begin. The vehicle moves `step`, m, in a period at most, so parts that it cannot
+    reach are passed over.
     """
     out = np.full(len(rows), far)
     setpoints, last = len(places) - 1, places.shape[1] - 1
@@ -279,6 +280,13 @@ def _least_off_path(
                 low, high = boxes[way, rows[n], number, 0], boxes[way, rows[n], number, 1]
                 lies = high[2] <= 0.0
                 first = int(np.floor(number * part)) + window[0]
+                x, y = places[min(max(own[n], 0), setpoints), 0]
+                a, b = max(low[0] - x, x - high[0], 0.0), max(low[1] - y, y - high[1], 0.0)
+                periods = min(max(abs(first), first + window[1] - window[0] + 1), begins[-1] + last)
+                if np.sqrt(a * a + b * b) - step * (begins[-1] + last if lies else periods) > out[n]:
+                    if lies:
+                        break
+                    continue
                 for begin in begins:
                     row = min(max(own[n] + begin, 0), setpoints)
                     for k in range(first, first + window[1] - window[0] + 2):

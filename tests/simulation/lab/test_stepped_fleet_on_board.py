@@ -11,7 +11,7 @@ from cfplan.flight.on_board.fall import fall_tubes
 from cfplan.flight.pilot.keys import Order
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Phase, PhaseEntered
-from cfplan.planning.fleet.lost import BACK
+from cfplan.planning.fleet.lost import BACK, NOTICED
 from cfplan.planning.fleet.separation import allowed_deviation
 from cfplan.preparation.on_board_fleet import prepare_fleet_on_board
 from cfplan.safety.limits_file import load_limits
@@ -116,7 +116,8 @@ def test_a_lost_vehicle_falls_in_its_tube_and_the_other_stops_clear_of_it(fleet,
     since = truth.time - (flight.outcomes[lost.name].first_setpoint + moment)
     part = 1.0 / RATE
     once = np.array([moment])
-    (row,) = fall_tubes(lost.plan.trajectory, once, limits, deviation=0.06, part=4 * part, back=BACK)[1]
+    stops = BACK, NOTICED[1]
+    (row,) = fall_tubes(lost.plan.trajectory, once, limits, deviation=0.06, part=4 * part, stops=stops)[3]
     flown = since > 0.0
     parts = np.minimum(since[flown] / (4 * part), len(row) - 1).astype(int)
     low = np.minimum(row[parts, 0], row[np.maximum(parts - 1, 0), 0])
