@@ -9,11 +9,11 @@ from cfplan.errors import ExitCode
 from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
 from cfplan.flight.on_board.fall import fall_tubes
 from cfplan.flight.pilot.keys import Order
-from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Phase, PhaseEntered
 from cfplan.planning.fleet.lost import BACK, NOTICED
 from cfplan.planning.fleet.separation import allowed_deviation
 from cfplan.preparation.on_board_fleet import prepare_fleet_on_board
+from cfplan.preparation.plan_fleet import lost_clearance
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_fleet import SteppedFleet
@@ -23,6 +23,7 @@ from cfplan.simulation.virtual_crazyflie.supervisor import State
 pytestmark = pytest.mark.integration
 
 REPOSITORY = Path(__file__).parents[3]
+FOR_GOOD = float("inf")  # s
 DISARMED = (State.CHECKS_NOT_PASSED, State.CHECKS_PASSED, State.RESET, State.LOCKED, State.CRASHED)
 FLEET = """
 vehicles:
@@ -103,26 +104,29 @@ def test_all_stop_off_their_paths_no_nearer_than_certified(fleet, prepared, mome
     assert columns_apart(flight) > planned.separations[0].distance - 2.0 * allowed_deviation(planned.apart)
 
 
-@pytest.mark.parametrize("moment", [pytest.param(0.6, marks=pytest.mark.slow), 1.3])
-def test_a_lost_vehicle_falls_in_its_tube_and_the_other_stops_clear_of_it(fleet, prepared, moment):
+@pytest.mark.parametrize(
+    ("moment", "lasts"),
+    [
+        (1.3, FOR_GOOD),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((0.6, FOR_GOOD), (0.8, 0.7), (1.3, 0.9))),
+    ],
+)
+def test_a_lost_vehicle_stays_in_its_tube_and_the_other_stops_clear_of_it(fleet, prepared, moment, lasts):
+    """Its link dies for good, or is back before the watchdog stops its motors."""
     planned, missions = prepared
     lost = max(planned.members, key=lambda each: each.delay)
     lab = fleet.labs[lost.name]
-    flight = fly(fleet, lost.name, moment, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD)))
+    flight = fly(fleet, lost.name, moment, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, lasts)))
     assert flight.brakes.startswith(f"{lost.name}: the vehicle has acknowledged nothing")
     assert_down(flight)
-    assert columns_apart(flight) > planned.losses[0].distance - allowed_deviation(planned.apart)
+    assert columns_apart(flight) > lost_clearance(planned.apart)
     truth, limits = flight.truths[lost.name], missions[lost.name].limits
     since = truth.time - (flight.outcomes[lost.name].first_setpoint + moment)
-    part = 1.0 / RATE
-    once = np.array([moment])
-    stops = BACK, NOTICED[1]
-    (row,) = fall_tubes(lost.plan.trajectory, once, limits, deviation=0.06, part=4 * part, stops=stops)[3]
-    flown = since > 0.0
-    parts = np.minimum(since[flown] / (4 * part), len(row) - 1).astype(int)
-    low = np.minimum(row[parts, 0], row[np.maximum(parts - 1, 0), 0])
-    high = np.maximum(row[parts, 1], row[np.maximum(parts - 1, 0), 1])
-    places = truth.position[flown]
-    flies = places[:, 2] > 0.05
-    assert (low[flies, :2] <= places[flies, :2]).all()
-    assert (places[flies, :2] <= high[flies, :2]).all()
+    part, once, stops = 0.04, np.array([moment]), (BACK, NOTICED[1])
+    tubes = fall_tubes(lost.plan.trajectory, once, limits, deviation=0.06, part=part, stops=stops)[1:, 0]
+    flown = (since > 0.0) & (truth.position[:, 2] > 0.05)
+    parts = np.minimum(since[flown] / part, tubes.shape[1] - 1).astype(int)
+    before = np.maximum(parts - 1, 0)
+    low, high = (side(tubes[:, parts], tubes[:, before]) for side in (np.minimum, np.maximum))
+    places = truth.position[flown, :2]
+    assert ((low[:, :, 0, :2] <= places) & (places <= high[:, :, 1, :2])).all(axis=2).any(axis=0).all()
