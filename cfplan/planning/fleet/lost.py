@@ -43,7 +43,8 @@ _RESTS = 1e3  # s before its start, of a vehicle that waits for long
 class Tube(NamedTuple):
     """The space that a vehicle may be in after its link is lost, for each setpoint of its plan."""
 
-    boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time; in K ways, a lost link the last
+    boxes: NDArray  # (K, R, S, 2, 3) m, low and high corners in S parts of the time
+    """In K ways: first of a vehicle whose motors stop at once, then of one whose link is lost."""
     rate: float  # Hz, of the R setpoints
     part: float  # s of each part; the last one, in which it lies, lasts
     first: int = 0  # row of the plan's first setpoint; those before it are of a vehicle that still waits
@@ -313,8 +314,9 @@ def tubes_apart(tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, sk
     Both own times, (N,) s, are those of one moment; by their clocks they differ by `skew`, s, at most.
     """
     late = int(np.ceil(skew * tube.rate))
-    rows = other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
-    return np.asarray(_least_of_tubes(tube.boxes[-1], tube.rows(own), other.boxes[-1], rows))
+    rows = tube.rows(own), other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
+    ways = itertools.product(tube.boxes[1:], other.boxes[1:])  # the first is that of motors that stop at once
+    return np.min([_least_of_tubes(a, rows[0], b, rows[1]) for a, b in ways], axis=0)
 
 
 @njit(nogil=True, error_model="numpy")

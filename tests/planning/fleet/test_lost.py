@@ -179,7 +179,8 @@ def test_boxes_of_two_tubes_are_compared_part_by_part():
     still = np.zeros((1, 3, 2, 2, 3))
     moved = still + np.array([1.0, 0.0, 0.0])
     moved[0, :, 1, :, 0] = 0.3
-    a, b = Tube(still, RATE, 0.04), Tube(moved, RATE, 0.04)
+    far = np.full_like(still, 50.0)  # of motors that stop at once, which these two do not do together
+    a, b = (Tube(np.concatenate([far, lost]), RATE, 0.04) for lost in (still, moved))
     own = np.array([0.0, 0.02])
     assert tubes_apart(a, own, b, own, SKEW) == pytest.approx([0.3, 0.3])
     assert tubes_apart(b, own, a, own, SKEW) == pytest.approx([0.3, 0.3])
