@@ -328,6 +328,23 @@ def test_a_vehicle_that_fell_to_the_floor_without_poses_stays_there(hidden, line
     assert (flown.rung, flown.landed, flown.disarmed, flown.readable) == ("cut", True, True, True)
 
 
+@pytest.fixture(scope="module")
+def small_6(tmp_path_factory):
+    """The small path of that number of the study."""
+    space = limits_for(LINE).space
+    box = np.array([np.array(space.low) + space.margin, np.array(space.high) - space.margin])
+    file = tmp_path_factory.mktemp("small") / "small-6.yaml"
+    file.write_text(f"waypoints: {random_waypoints(6, box, (2, 3)).round(3).tolist()}\n")
+    return prepare_mission(file, load_limits(REPOSITORY / "safety.yaml"), PATIENT)
+
+
+def test_a_vehicle_that_stands_blind_and_unheard_does_not_fly_off(small_6):
+    """Its poses were turned and its log was silent: its motors ran on for 1.7 s, and it ended 0.7 m outside."""
+    flown = fly_scenario(with_silence(random_scenario(81084, small_6), 81084), small_6, 81084)
+    assert flown.to_wall > 0.1
+    assert (flown.rung, flown.landed, flown.disarmed, flown.readable) == ("land", True, True, True)
+
+
 def test_late_poses_a_tumble_and_no_poses_end_inside(slalom):
     """The one of 13,001 random flights that left the walls, by 0.54 m: its late poses spoilt the estimate."""
     flown = fly_scenario(random_scenario(12771, slalom), slalom, 12771)

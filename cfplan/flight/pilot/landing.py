@@ -122,7 +122,7 @@ class Landing:
             return loop.now() - fresh_since > POSES_TRUSTED_AFTER
 
         def over() -> bool:
-            return self._setpoint_at_end() or loop.time_without_poses > MAX_BLIND_LANDING or self._beneath_by_estimate()
+            return self._setpoint_at_end() or loop.time_without_poses > MAX_BLIND_LANDING or self._beneath_floor()
 
         def interrupted() -> bool:
             return poses_back() or loop.descent is Descent.HELD
@@ -178,13 +178,16 @@ class Landing:
         if not shown:
             self._loop.history.add_event(Level.WARNING, "touchdown is not confirmed; the motors are stopped")
 
-    def _beneath_by_estimate(self) -> bool:
+    def _beneath_floor(self) -> bool:
         """Return whether the vehicle's estimate is far below the floor, from where it would climb.
 
-        It stands then, after a fall that its sensors did not follow, or is low.
+        It stands then, after a fall that its sensors did not follow, or is low. Where its log is silent, the setpoint
+        shows it: the estimate of a vehicle that stands blind and unheard sinks on until it flies off.
         """
-        estimate = self._loop.estimate
-        return estimate is not None and estimate.position[2] < self._floor - _ESTIMATE_DEPTH
+        loop, lowest = self._loop, self._floor - _ESTIMATE_DEPTH
+        if loop.estimate is not None and loop.estimate.position[2] < lowest:
+            return True
+        return loop.health.estimate is not FRESH and loop.setpoint_now()[0][2] < lowest
 
     def _stands_by_estimate(self) -> bool:
         """Return whether the vehicle stands, as its estimate is far above its setpoint, or its motors have been off.
