@@ -1,13 +1,16 @@
 """`cfplan export`: write a certified plan in the formats of other tools."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from cfplan.cli import fleet, options
 from cfplan.cli.output import Steps, print_json
 from cfplan.errors import InputError
+
+if TYPE_CHECKING:
+    from cfplan.safety.certificate import Certificate
 
 _FORMS = ("crazyswarm", "memory", "compressed", "samples")
 
@@ -58,7 +61,6 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
     _check_file(form, output, force)
     limits = options.read_limits(safety_file, path_or_plan, steps)
     with steps.waiting("loading planners"):
-        from cfplan.cli.certificate_table import print_certificate
         from cfplan.preparation import export_flight
         from cfplan.preparation.plan_flight import plan_flight
 
@@ -77,10 +79,13 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
             export_flight.write_polynomials(exported, kind, output)
             results.append(str(output))
         document, certificate = exported.to_dict(), exported.on_board.certificate
-    if as_json:
-        print_json(document | {"file": str(output)})
-    else:
-        print_certificate(certificate)
+    _print(document | {"file": str(output)}, certificate, as_json=as_json)
+
+
+def _print(document: dict[str, Any], certificate: "Certificate", *, as_json: bool) -> None:
+    from cfplan.cli.certificate_table import print_certificate
+
+    print_json(document) if as_json else print_certificate(certificate)
 
 
 def _check_pieces(form: str, pieces: int | None) -> None:

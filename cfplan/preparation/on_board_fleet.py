@@ -49,7 +49,7 @@ from cfplan.vehicle.trajectory import Trajectory
 
 _PART = 0.04  # s of a part of a tube
 _BEFORE_START = -10.0  # s: a vehicle that is lost then hovers until it falls
-_LEAD = 0.08  # m, about, by which polynomials lead their plan; assumed until they are fitted
+_LEAD = 0.08  # m; the assumed lead of polynomials before they are fitted
 
 
 def prepare_fleet_on_board(

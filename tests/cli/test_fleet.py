@@ -34,7 +34,7 @@ def export(cfplan, fleet_file, safety_file, tmp_path):
 
 
 def places_of_crazyswarm(file, times):
-    """Return x and y at each time, as Crazyswarm flies a file that it was told to start at 0; (N, 2) m."""
+    """Return the x and y, (N, 2) m, that Crazyswarm flies at each time after the start of a file."""
     table = np.loadtxt(file, delimiter=",", skiprows=1, ndmin=2)
     begins = np.concatenate([[0.0], np.cumsum(table[:, 0])])
     rows = np.clip(np.searchsorted(begins, times, side="right") - 1, 0, len(table) - 1)

@@ -18,7 +18,7 @@ from cfplan.planning.fleet.members import FleetMember
 STRIDE = 3 * TICK  # s of a plan's own time, from one row of a map to the next
 _FAR = 0.2  # m beyond the clearance, from which on a distance does not matter
 _MOST_SLACK = 0.1  # m, less than _FAR, as distances beyond that are not known
-BEFORE = 2.4  # s before a start, from which on the start hardly matters
+BEFORE = 2.4  # s, the longest time before a start that a map covers
 
 
 @dataclass(frozen=True, slots=True)

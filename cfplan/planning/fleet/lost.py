@@ -268,10 +268,10 @@ def _least_off_path(
 ) -> NDArray:  # fmt: skip
     """Return the least distances, (N,) m, of boxes to a vehicle that begins one of its stops after the loss.
 
-    `places`, (R, M, 2) m, are those of the stops from each of its setpoints, of which `own`, (N,), are in force at the
-    loss; `begins`, (B,), are periods until a stop begins. A part of the tube lasts `part` periods, and is compared with
-    the periods in `window` about its begin. The vehicle moves `step`, m, in a period at most, so parts that it cannot
-    reach are passed over.
+    `places`, (R, M, 2) m, are the places of the stops from each of its R setpoints; `own`, (N,), are the setpoints at
+    which the losses happen; `begins`, (B,), are periods from the loss until a stop begins. A part of the tube lasts
+    `part` periods, and is compared with the periods in `window` about its begin. The vehicle moves `step`, m, in a
+    period at most, so parts that it cannot reach are passed over.
     """
     out = np.full(len(rows), far)
     setpoints, last = len(places) - 1, places.shape[1] - 1
