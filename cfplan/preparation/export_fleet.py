@@ -65,7 +65,7 @@ def plan_fleet_to_export(
     planned = limits if form is Form.SAMPLES else limits_for_polynomials(limits)
     fleet = load_fleet(source, on_step)
     alone = plan_alone(fleet, planned, options, on_step)
-    return replace(coordinate_fleet(fleet, alone, planned, None, on_step), limits=limits)
+    return replace(coordinate_fleet(fleet, alone, planned, None, on_step, options=options), limits=limits)
 
 
 def fit_fleet(fleet: PlannedFleet, fit: Fit, on_step: OnStep = ignore_steps) -> FittedFleet:

@@ -73,7 +73,8 @@ def prepare_fleet_on_board(
         for each in plan_alone(fleet, gentle, options, on_step)
     ]
     model = _loss_model(fleet, limits, once_per_plan(_stops_of_plan))
-    planned = replace(coordinate_fleet(fleet, alone, gentle, model, on_step, slower_for_fall), limits=limits)
+    planned = coordinate_fleet(fleet, alone, gentle, model, on_step, options=options, finish=slower_for_fall)
+    planned = replace(planned, limits=limits)
 
     def fit(flight: PlannedFlight, wait: float, on_step: OnStep) -> ExportedFlight:
         return fit_for_program(flight, on_step)

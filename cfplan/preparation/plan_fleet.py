@@ -21,6 +21,7 @@ from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import CLEAR, Separation, Stops, allowed_deviation, separations, stop_separations
 from cfplan.planning.plan_result import Plan
+from cfplan.preparation.paths_around import PathsAround
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
 from cfplan.preparation.slow_motion import require_harmless_slow_motion
@@ -139,7 +140,7 @@ def plan_fleet(
     """
     fleet = load_fleet(source, on_step)
     alone = plan_alone(fleet, limits, options, on_step)
-    return coordinate_fleet(fleet, alone, limits, loss_model(fleet, limits), on_step)
+    return coordinate_fleet(fleet, alone, limits, loss_model(fleet, limits), on_step, options=options)
 
 
 def load_fleet(source: Path | FleetFile, on_step: OnStep = ignore_steps) -> FleetFile:
@@ -174,29 +175,42 @@ def coordinate_fleet(
     limits: Limits,
     model: LossModel | None,
     on_step: OnStep = ignore_steps,
+    *,
+    options: FlightOptions | None = None,
     finish: Finish | None = None,
 ) -> PlannedFleet:
     """Coordinate certified plans; certify every pair, and every vehicle and dongle that may be lost.
 
-    `finish` finishes plans that were made again; by default they give way as streamed ones do. Without a model of lost
-    vehicles, these are not regarded. Raises InfeasibleError and NotCertifiedError as plan_fleet().
+    Where no clocks keep the vehicles apart, a path is chosen again, and planned with `options`. `finish` finishes plans
+    that were made again; by default they give way as streamed ones do. Without a model of lost vehicles, these are not
+    regarded. Raises InfeasibleError and NotCertifiedError as plan_fleet().
     """
-    finish, stops = finish or _given_way, None if model is None else model.stops
+    around, stops = PathsAround(fleet, limits, options, finish), None if model is None else model.stops
     longest = max(member.plan.trajectory.duration for member in alone)
-    with step(on_step, "coordination") as results:
-        members = coordinate(alone, fleet.apart, fleet.skew, finish, model, stops)
+
+    def coordinated(alone: Sequence[FleetMember]) -> tuple[FleetMember, ...] | Blocked:
+        members = coordinate(alone, fleet.apart, fleet.skew, finish or _given_way, model, stops)
         if isinstance(members, Blocked) and model is not None:
-            members = coordinate(alone, fleet.apart, fleet.skew, finish, stops=stops)
-        if isinstance(members, Blocked):
-            raise InfeasibleError(
-                f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {members}",
-                where=fleet.name,
-                hint="move that path with `place`, or reverse its waypoints",
-            )
+            members = coordinate(alone, fleet.apart, fleet.skew, finish or _given_way, stops=stops)
+        return members
+
+    with step(on_step, "coordination") as results:
+        members = first = coordinated(alone)
+        while isinstance(members, Blocked):
+            led = around.lead(alone, members)
+            if led is None:
+                raise InfeasibleError(
+                    f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {first}",
+                    where=fleet.name,
+                    hint="move that path with `place`, or reverse its waypoints",
+                )
+            alone = led
+            members = coordinated(alone)
         waiting = sum(member.delay > 0.0 for member in members)
         slower = sum(new.plan is not old.plan for new, old in zip(members, alone, strict=True))
         end = max(member.end for member in members)
         results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
+        results += around.describe()
         results.append(f"waiting at the start: {waiting}, slowed: {slower}")
     found = certify_separation(fleet, members, stops, on_step)
     losses: tuple[Loss, ...] = ()

@@ -45,12 +45,12 @@ class Blocked(NamedTuple):
     """Why no order was found: where one vehicle is blocked by another."""
 
     pair: tuple[str, str]
-    place: tuple[float, float]  # m, x and y, of the first
+    places: tuple[tuple[float, float], tuple[float, float]]  # m, x and y, of both, at least about
     time: float  # s after the fleet's start
 
     def __str__(self) -> str:
         a, b = self.pair
-        x, y = self.place
+        x, y = self.places[0]
         return f"{b} blocks {a} at ({x:.2f}, {y:.2f}) m, {self.time:.2f} s after the start"
 
 
@@ -259,10 +259,12 @@ class _Search:
     def _blocked(self, number: int, stuck: Stuck, tracks: list[_Track]) -> Blocked:
         """Return where a vehicle is stuck, and the other vehicle that is nearest to its next position."""
         trajectory = self.members[number].plan.trajectory
-        (x, y), ahead = places(trajectory, np.array([stuck.own, stuck.own + TICK])).tolist()
-        then = np.array([stuck.time])
-        nearest = min(tracks, key=lambda track: float(np.linalg.norm(track.columns(then)[0] - ahead)))
-        return Blocked((self.members[number].name, self.members[nearest.number].name), (x, y), stuck.time)
+        here, ahead = places(trajectory, np.array([stuck.own, stuck.own + TICK]))
+        others = [track.columns(np.array([stuck.time]))[0] for track in tracks]
+        nearest = int(np.argmin([np.linalg.norm(other - ahead) for other in others]))
+        pair = self.members[number].name, self.members[tracks[nearest].number].name
+        (x, y), (other_x, other_y) = here.tolist(), others[nearest].tolist()
+        return Blocked(pair, ((x, y), (other_x, other_y)), stuck.time)
 
 
 def _may_start(start: NDArray, others: NDArray, keeps: float, goes_on: int) -> NDArray:
@@ -283,7 +285,7 @@ def _distance_at_rest(members: Sequence[FleetMember]) -> float:
 
 def _blocked_by(near: Separation | Loss) -> Blocked:
     """Return which pair comes too near, as the reason why a vehicle gets no farther."""
-    return Blocked(near.pair, near.place, near.time)
+    return Blocked(near.pair, (near.place, near.place), near.time)
 
 
 def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:

@@ -132,8 +132,8 @@ def test_vehicles_that_meet_on_one_line_are_refused_with_pair_place_and_time(mem
     blocked = coordinate(head_on, APART, SKEW, lambda slower: slower)
     assert isinstance(blocked, Blocked)
     assert set(blocked.pair) == {"east", "west"}
-    assert low <= blocked.place[0] <= high
-    assert blocked.place[1] == pytest.approx(0.0, abs=0.06)
+    assert all(low <= x <= high for x, y in blocked.places)
+    assert [y for x, y in blocked.places] == pytest.approx([0.0, 0.0], abs=0.06)
     assert math.isfinite(blocked.time)
 
 

@@ -1,0 +1,56 @@
+"""Where no clocks keep two vehicles apart, the path of one that cfplan chooses is led around the other."""
+
+import numpy as np
+import pytest
+
+from cfplan.errors import InfeasibleError
+from cfplan.preparation.plan_fleet import plan_fleet
+
+APART, SKEW = 0.35, 0.03
+ENDS = {"there": ([0.0, -1.6, 1.0], [0.0, 1.2, 1.0]), "back": ([0.0, 1.6, 1.0], [0.0, -1.2, 1.0])}
+
+
+@pytest.fixture
+def face_to_face(tmp_path):
+    """Two vehicles that meet on one line; `shapes` are those of their paths."""
+
+    def make(shapes):
+        lines = [f"apart: {APART}", f"skew: {SKEW}", "lost: warn", "vehicles:"]
+        for (name, ends), shape in zip(ENDS.items(), shapes, strict=True):
+            (tmp_path / f"{name}.yaml").write_text(f"waypoints: {list(ends)}\nshape: {shape}\n")
+            lines.append(f"  {name}: {{path: {name}.yaml}}")
+        file = tmp_path / "fleet.yaml"
+        file.write_text("\n".join(lines))
+        return file
+
+    return make
+
+
+@pytest.mark.parametrize("shapes", [("fastest", "fastest"), ("min-snap", "fastest"), ("fastest", "min-snap")])
+def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, shapes):
+    steps = {}
+    fleet = plan_fleet(face_to_face(shapes), limits, on_step=lambda name, state, result: steps.update({name: result}))
+
+    times = np.arange(0.0, fleet.end + 0.5, 0.002)
+
+    def columns(member, late):
+        trajectory = member.plan.trajectory
+        return trajectory.at(np.clip(times + late - member.delay, 0.0, trajectory.duration)).position[:, :2]
+
+    there, back = fleet.members
+    nearest = min(
+        float(np.linalg.norm(columns(there, 0.0) - columns(back, late), axis=1).min())
+        for late in np.linspace(-SKEW, SKEW, 13)
+    )
+    assert nearest > APART - 1e-3
+    for member in fleet.members:
+        assert np.allclose(member.plan.path(np.array([0.0, member.plan.path.end])), ENDS[member.name], atol=1e-6)
+        straight = np.abs(member.plan.path(np.linspace(0.0, member.plan.path.end, 200))[:, 0]).max() < 1e-6
+        led = f"{member.name} leads around" in steps["coordination"]
+        assert led != straight
+    assert "leads around" in steps["coordination"]
+
+
+def test_paths_that_are_given_are_not_led_elsewhere(face_to_face, limits):
+    with pytest.raises(InfeasibleError, match=r"0\.35 m apart: .* blocks "):
+        plan_fleet(face_to_face(("min-snap", "min-snap")), limits)
