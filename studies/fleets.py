@@ -1,40 +1,38 @@
 """Coordinate random fleets in the shipped room, with and without regard to lost vehicles, and check them densely.
 
-Each fleet flies random min-snap paths, which are planned alone before. A fleet of fewer vehicles has the first paths of
-the largest one of the same seed. The checks share no code with the certificates: they compare the states of the plans
-over the skew, and the stops from every setpoint when all brake, and fly drawn vehicles without link and poses beside
-the others, which brake.
+Each fleet flies the fastest paths through random waypoints, which are planned alone before. A fleet of fewer vehicles
+has the first paths of the largest one of the same seed. The checks share no code with the certificates: they compare
+the states of the plans over the skew, and the stops from every setpoint when all brake, and fly drawn vehicles without
+link and poses beside the others, which brake.
 """
 
 import itertools
+import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, InfeasibleError
 from cfplan.flight.setpoints.encoding import RATE, EncodedFlight
 from cfplan.flight.setpoints.stops import stop_motion
-from cfplan.geometry.min_snap import min_snap
+from cfplan.geometry.path_file import path_through
 from cfplan.geometry.random_paths import generator, random_waypoints
 from cfplan.planning.fleet.coordination import Blocked, coordinate
-from cfplan.planning.fleet.fleet_file import APART, SKEW, FleetFile
+from cfplan.planning.fleet.fleet_file import LEAST_APART, SKEW, FleetFile, FleetVehicle
 from cfplan.planning.fleet.lost import NOTICED
 from cfplan.planning.fleet.members import FleetMember
-from cfplan.planning.fleet.separation import separations
-from cfplan.planning.plan import plan
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.plan_fleet import loss_model
-from cfplan.preparation.plan_flight import PlannedFlight, give_way
+from cfplan.preparation.plan_fleet import coordinate_fleet, loss_model
+from cfplan.preparation.plan_flight import PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits import Limits
-from cfplan.safety.space import check_space
 from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.dry_run import fly_drawn, rehearsed_flight
 from studies.drawn_paths import WAYPOINTS
@@ -53,24 +51,28 @@ class Settings:
     """The fleets to coordinate, and how densely lost vehicles are flown."""
 
     fleets: int = option(200, "Number of fleets of each size.", least=1)
+    lost: int = option(20, "Number of these that are coordinated with regard to lost vehicles too.", least=0)
     sizes: tuple[int, ...] = option((2, 3, 4, 6), "Number of vehicles of a fleet.", least=2)
+    apart: float = option(LEAST_APART, "Distance that vehicles keep, m.", least=LEAST_APART)
     moments: int = option(12, "Moments at which each vehicle is lost in the check.", least=1)
     seed: int = option(0, "Seed of the first fleet.", least=0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CoordinatedFleet:
     """A fleet, coordinated without and with regard to lost vehicles; NaN where that was not possible."""
 
-    seed: int
+    name: str
     vehicles: int
-    makespan: float  # of the slowest vehicle alone, without regard to lost vehicles
-    seconds: float  # of processor time: coordination and certificate
-    nearest: float  # m, of a pair, on their paths and when all brake, by the check
-    exposed: float  # fraction of the time for which a vehicle must not be lost, mean of the vehicles
-    lost_makespan: float
-    lost_seconds: float
-    lost_nearest: float  # m, of a lost vehicle and another, by the check
+    planning: float = 0.0  # s of processor time, of the plans alone
+    makespan: float = math.nan  # of the slowest vehicle alone, without regard to lost vehicles
+    led: int = 0  # paths that lead around another vehicle
+    seconds: float = 0.0  # s of processor time, of coordination and certificate
+    nearest: float = math.nan  # m, of a pair, on their paths and when all brake, by the check
+    regards_lost: bool = False  # whether it was also coordinated with regard to lost vehicles
+    lost_makespan: float = math.nan
+    lost_seconds: float = math.nan
+    lost_nearest: float = math.nan  # m, of a lost vehicle and another, by the check
 
     @property
     def solved(self) -> bool:
@@ -89,16 +91,20 @@ COLUMNS = (
     Column("solved", "keep apart", of="fleets", value=count("solved")),
     Column("makespan", "makespan", "", ".3f", meaning="mean; over the slowest vehicle alone",
            value=among("solved", mean("makespan"))),
-    Column("seconds", "median", "s", ".1f", meaning="processor time, without that of the plans alone",
+    Column("led", "around", meaning="fleets with a path that was chosen again, around another vehicle",
+           value=count("led")),
+    Column("planning", "planning", "s", ".1f", meaning="processor time of the plans alone, median",
+           value=quantile("planning", 0.5)),
+    Column("seconds", "median", "s", ".1f", meaning="processor time of coordination and certificate",
            value=quantile("seconds", 0.5)),
+    Column("seconds_95", "95 %", "s", ".1f", value=quantile("seconds", 0.95)),
     Column("nearest", "nearest", "m", ".3f", meaning="of all pairs, also when all brake, by the dense check",
            value=among("solved", smallest("nearest"))),
-    Column("exposed", "exposed", "%", ".0f", meaning="mean; fraction of the time at which a lost vehicle may come too "
-           "near to another", value=among("solved", mean("exposed"))),
-    Column("keeps_lost", "also keep clear of the lost", of="fleets", value=count("keeps_lost")),
+    Column("regards_lost", "regarding lost vehicles", value=count("regards_lost")),
+    Column("keeps_lost", "also keep clear of the lost", of="regards_lost", value=count("keeps_lost")),
     Column("lost_makespan", "makespan then", "", ".2f", meaning="mean; over the slowest vehicle alone",
            value=among("keeps_lost", mean("lost_makespan"))),
-    Column("lost_seconds", "median then", "s", ".1f", value=quantile("lost_seconds", 0.5)),
+    Column("lost_seconds", "median then", "s", ".1f", value=among("regards_lost", quantile("lost_seconds", 0.5))),
     Column("lost_nearest", "nearest lost", "m", ".3f", meaning="of drawn vehicles without link and poses to the others "
            "that brake", value=among("keeps_lost", smallest("lost_nearest"))),
 )  # fmt: skip
@@ -107,66 +113,81 @@ COLUMNS = (
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per seed: its fleets of all sizes."""
     seeds = range(settings.seed, settings.seed + settings.fleets)
-    cases = {f"fleet {seed}": (seed, settings.sizes, settings.moments) for seed in seeds}
+    cases = {f"fleet {seed}": (seed, settings, number < settings.lost) for number, seed in enumerate(seeds)}
     return Work(cases, partial(measure, limits=limits_for(Path())), CoordinatedFleet)
 
 
-def measure(case: tuple[int, Sequence[int], int], limits: Limits) -> list[CoordinatedFleet]:
+def measure(case: tuple[int, Settings, bool], limits: Limits) -> list[CoordinatedFleet]:
     """Plan the paths of a seed alone, and coordinate fleets of the first of them."""
-    seed, sizes, moments = case
-    members = list(itertools.islice(_members(seed, limits), max(sizes)))
-    return [_coordinated(seed, members[:size], limits, moments) for size in sizes]
+    seed, settings, with_lost = case
+    alone = list(itertools.islice(_alone(seed, settings.apart, limits), max(settings.sizes)))
+    rows = []
+    for size in settings.sizes:
+        fleet = FleetFile(f"seed {seed}", tuple(each.vehicle for each in alone[:size]), settings.apart, SKEW)
+        members = [each.member for each in alone[:size]]
+        row = _coordinated(fleet, members, limits)
+        row.planning = sum(each.seconds for each in alone[:size])
+        if with_lost:
+            _regard_lost(row, fleet, members, limits, settings)
+        rows.append(row)
+    return rows
 
 
-def _members(seed: int, limits: Limits) -> Iterator[FleetMember]:
-    """Yield vehicles on random paths, whose starts and whose ends are apart."""
+class _Alone(NamedTuple):
+    vehicle: FleetVehicle
+    member: FleetMember
+    seconds: float  # of processor time, of its plan
+
+
+def _alone(seed: int, apart: float, limits: Limits) -> Iterator[_Alone]:
+    """Yield vehicles on the fastest paths through random waypoints, whose starts and whose ends are apart."""
     distance = limits.space.margin + _FROM_MARGIN
     box = np.array([limits.space.low, limits.space.high]) + np.array([[distance], [-distance]])
     ends: list[NDArray] = []
     for number in itertools.count():
         with suppress(CfplanError):  # the path leaves the space between its waypoints, or has no flight
-            path = min_snap(random_waypoints(np.random.SeedSequence([seed, number]), box, WAYPOINTS))
-            check_space(path, limits.space)
-            both = path(np.array([0.0, path.end]))[:, :2]
-            if all((np.linalg.norm(both - other, axis=1) >= APART).all() for other in ends):
-                planned = give_way(plan(path, limits.airframe, limits))[0]
+            path_file = path_through(random_waypoints(np.random.SeedSequence([seed, number]), box, WAYPOINTS))
+            both = path_file.waypoints[[0, -1], :2]
+            if all((np.linalg.norm(both - other, axis=1) >= apart).all() for other in ends):
+                begun = time.process_time()
+                planned = plan_flight(path_file, limits).plan
                 ends.append(both)
-                yield FleetMember(f"v{len(ends)}", planned)
+                name = f"v{len(ends)}"
+                seconds = time.process_time() - begun
+                yield _Alone(FleetVehicle(name, path_file), FleetMember(name, planned), seconds)
 
 
-def _coordinated(seed: int, alone: Sequence[FleetMember], limits: Limits, moments: int) -> CoordinatedFleet:
-    model = loss_model(FleetFile("", (), APART, SKEW), limits)
-    longest = max(member.end for member in alone)
-    numbers = range(len(alone))
+def _coordinated(fleet: FleetFile, alone: Sequence[FleetMember], limits: Limits) -> CoordinatedFleet:
+    """Coordinate a fleet without regard to lost vehicles."""
+    row, begun = CoordinatedFleet(fleet.name, len(alone)), time.process_time()
+    with suppress(InfeasibleError):
+        made = coordinate_fleet(fleet, alone, limits, None)
+        row.makespan = made.end / made.alone
+        row.led = sum(a.plan.path.length != b.plan.path.length for a, b in zip(alone, made.members, strict=True))
+    row.seconds = time.process_time() - begun
+    if row.solved:
+        row.nearest = _nearest_pair(made.members, limits)
+    return row
 
-    begun = time.process_time()
-    apart = coordinate(alone, APART, SKEW, _given_way)
-    seconds = time.process_time() - begun
-    nearest = exposed = makespan = lost_makespan = lost_nearest = np.nan
-    if not isinstance(apart, Blocked):
-        begun = time.process_time()
-        separations(apart, SKEW)
-        seconds += time.process_time() - begun
-        makespan = max(each.end for each in apart) / longest
-        nearest = _nearest_pair(apart, limits)
-        exposed = float(np.mean([each.exposed for each in model.losses(apart, numbers, SKEW)]))
 
-    begun = time.process_time()
-    clear = coordinate(alone, APART, SKEW, _given_way, model)
-    lost_seconds = time.process_time() - begun
+def _regard_lost(
+    row: CoordinatedFleet, fleet: FleetFile, alone: Sequence[FleetMember], limits: Limits, settings: Settings
+) -> None:
+    """Coordinate the fleet of a row with regard to lost vehicles too."""
+    model = loss_model(fleet, limits)
+    row.regards_lost, begun = True, time.process_time()
+    clear = coordinate(alone, fleet.apart, fleet.skew, _given_way, model)
+    row.lost_seconds = time.process_time() - begun
     if not isinstance(clear, Blocked):
-        lost_makespan = max(each.end for each in clear) / longest
-        lost_nearest = _nearest_lost(clear, limits, moments, seed)
-    return CoordinatedFleet(
-        seed, len(alone), makespan, seconds, nearest, exposed, lost_makespan, lost_seconds, lost_nearest
-    )  # fmt: skip
+        row.lost_makespan = max(each.end for each in clear) / max(each.end for each in alone)
+        row.lost_nearest = _nearest_lost(clear, limits, settings.moments, settings.seed)
 
 
 def _given_way(planned: Plan) -> Plan:
     return give_way(planned)[0]
 
 
-def _apart(a: FleetMember, b: FleetMember) -> float:
+def _distance(a: FleetMember, b: FleetMember) -> float:
     """Return the least distance of two vehicles, m, by the states of their plans at every 4 ms and seven skews."""
     times = np.arange(0.0, max(a.end, b.end) + 0.1, 0.004)
     of_a = _positions(a, times)
@@ -176,7 +197,7 @@ def _apart(a: FleetMember, b: FleetMember) -> float:
 
 def _nearest_pair(members: Sequence[FleetMember], limits: Limits) -> float:
     """Return the least distance of two vehicles on their paths, and when all brake at one moment, m."""
-    least = min(_apart(a, b) for a, b in itertools.combinations(members, 2))
+    least = min(_distance(a, b) for a, b in itertools.combinations(members, 2))
     ticks = np.arange(round((max(member.end for member in members) + 0.1) * RATE))
     stops = [_stops(member, ticks, limits) for member in members]
     for a, b in itertools.combinations(stops, 2):
@@ -242,7 +263,7 @@ def _least(way: NDArray, others: NDArray) -> float:
 
 def tables(settings: Settings, rows: list[Any]) -> Iterator[Table]:
     """Yield a table with one row per number of vehicles."""
-    yield table("fleets", f"Random fleets, {APART:g} m apart", COLUMNS, rows, by=("vehicles",))
+    yield table("fleets", f"Random fleets, {settings.apart:g} m apart", COLUMNS, rows, by=("vehicles",))
 
 
-STUDY = Study(Settings, work, tables, "--fleets 40 -o results/fleets.json")
+STUDY = Study(Settings, work, tables, "-o results/fleets.json")

@@ -1,12 +1,15 @@
 """Lead the path of a vehicle around another one where no start delays and clock rates keep the two apart.
 
-The column of the blocking vehicle becomes an obstacle when the path of the blocked one is chosen again; if that path
-cannot be led around it, the path of the other one is. Paths that cfplan does not choose stay as they are.
+A column of the blocking vehicle becomes an obstacle when the path of the blocked one is chosen again: where it starts,
+where it ends, or where it blocks, whichever that path does not keep clear of and can be led around. If there is none,
+the path of the other one is led around the blocked one. Paths that cfplan does not choose stay as they are.
 """
 
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from cfplan.errors import InfeasibleError
 from cfplan.geometry.path import Path
@@ -35,11 +38,13 @@ class PathsAround:
 
     def lead(self, members: Sequence[FleetMember], blocked: Blocked) -> list[FleetMember] | None:
         """Return the members with one path led around the other vehicle of a blocked pair; None if neither can be."""
+        if sum(map(len, self.columns.values())) == _MOST:
+            return None
         names = [member.name for member in members]
-        for name, other, (x, y) in zip(blocked.pair, blocked.pair[::-1], blocked.places[::-1], strict=True):
-            number = names.index(name)
-            columns = [*self.columns.get(number, []), self._column(other, x, y)]
-            if sum(map(len, self.columns.values())) < _MOST:
+        for name, other, blocks_at in zip(blocked.pair, blocked.pair[::-1], blocked.places[::-1], strict=True):
+            number, path = names.index(name), members[names.index(other)].plan.path
+            for x, y in (*path(np.array([0.0, path.end]))[:, :2].tolist(), blocks_at):
+                columns = [*self.columns.get(number, []), self._column(other, x, y)]
                 with suppress(InfeasibleError):
                     if (member := self._led(number, members[number], columns)) is not None:
                         self.columns[number] = columns
