@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+
 from studies.fleet_flights import STUDY, Settings
 from studies.runner.cases import run_study
 
