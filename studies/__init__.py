@@ -6,8 +6,8 @@ Run one with `python -m studies NAME`. Studies need a checkout; cfplan itself ne
 STUDIES = {
     name.rpartition(".")[2].replace("_", "-"): f"studies.{name}"
     for name in (
-        "blind_link_loss", "dry_runs", "exports", "faults", "fleet_faults", "fleets", "flights", "giving_way",
-        "horizon", "identification", "lateness", "latency", "link_loss", "physics", "planners",
+        "blind_link_loss", "dry_runs", "exports", "faults", "fleet_faults", "fleet_flights", "fleets", "flights",
+        "giving_way", "horizon", "identification", "lateness", "latency", "link_loss", "physics", "planners",
         "random_faults", "real_flights", "second_flights", "steering", "stops", "waypoints",
         "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
         "paper.search", "paper.simulators", "paper.yaw_consistency",

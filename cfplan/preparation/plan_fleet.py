@@ -1,6 +1,7 @@
 """From a fleet file to certified plans that keep apart.
 
-fleet file → each vehicle's plan → start delays and clock rates → the certificates of every pair and of lost vehicles
+fleet file → each vehicle's plan → start delays and clock rates, or else detours → the certificates of every pair and of
+lost vehicles
 """
 
 import math
@@ -21,7 +22,7 @@ from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import CLEAR, Separation, Stops, allowed_deviation, separations, stop_separations
 from cfplan.planning.plan_result import Plan
-from cfplan.preparation.paths_around import PathsAround
+from cfplan.preparation.detours import Detours
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import PreparedFlight, encode_flight, find_link_loss, make_mission, rehearse
 from cfplan.preparation.slow_motion import require_harmless_slow_motion
@@ -52,6 +53,7 @@ class PlannedFleet:
     losses: tuple[Loss, ...]  # of every vehicle and every shared dongle, the nearest first; none if not regarded
     alone: float  # s, the longest plan before coordination
     limits: Limits
+    detours: tuple[str, ...] = ()  # of replanned paths, one phrase each
 
     @property
     def end(self) -> float:
@@ -125,6 +127,7 @@ class PlannedFleet:
                 for each in self.separations
             ],
             "lost": [asdict(each) for each in self.losses],
+            "detours": self.detours,
         }
 
 
@@ -135,7 +138,7 @@ def plan_fleet(
 
     Raises:
         InputError: a file or an option is wrong.
-        InfeasibleError: a path has no certified plan, or no start delays and clock rates were found.
+        InfeasibleError: a path has no certified plan, or no start delays, clock rates or detours were found.
         NotCertifiedError: a pair comes too near.
     """
     fleet = load_fleet(source, on_step)
@@ -181,11 +184,12 @@ def coordinate_fleet(
 ) -> PlannedFleet:
     """Coordinate certified plans; certify every pair, and every vehicle and dongle that may be lost.
 
-    Where no clocks keep the vehicles apart, a path is chosen again, and planned with `options`. `finish` finishes plans
-    that were made again; by default they give way as streamed ones do. Without a model of lost vehicles, these are not
-    regarded. Raises InfeasibleError and NotCertifiedError as plan_fleet().
+    Where no clocks keep the vehicles apart, paths are replanned with `options`. `finish` finishes plans that were made
+    again; by default they give way as streamed ones do. Without a model of lost vehicles, these are not regarded.
+    Raises InfeasibleError and NotCertifiedError as plan_fleet().
     """
-    around, stops = PathsAround(fleet, limits, options, finish), None if model is None else model.stops
+    detours = Detours(fleet, limits, options or FlightOptions(), finish)
+    stops = None if model is None else model.stops
     longest = max(member.plan.trajectory.duration for member in alone)
 
     def coordinated(alone: Sequence[FleetMember]) -> tuple[FleetMember, ...] | Blocked:
@@ -195,29 +199,32 @@ def coordinate_fleet(
         return members
 
     with step(on_step, "coordination") as results:
-        members = first = coordinated(alone)
+        members = coordinated(alone)
         while isinstance(members, Blocked):
-            led = around.lead(alone, members)
-            if led is None:
+            replanned = detours.replan(alone, members)
+            if replanned is None:
                 raise InfeasibleError(
-                    f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {first}",
+                    f"no start delays and clock rates keep the vehicles {fleet.apart:g} m apart: {members}"
+                    + "".join(f"; {each}" for each in detours.describe()),
                     where=fleet.name,
-                    hint="move that path with `place`, or reverse its waypoints",
+                    hint="move one of the two paths with `place`, or reverse its waypoints",
                 )
-            alone = led
+            alone = replanned
             members = coordinated(alone)
         waiting = sum(member.delay > 0.0 for member in members)
         slower = sum(new.plan is not old.plan for new, old in zip(members, alone, strict=True))
         end = max(member.end for member in members)
         results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
-        results += around.describe()
+        results += detours.describe()
         results.append(f"waiting at the start: {waiting}, slowed: {slower}")
     found = certify_separation(fleet, members, stops, on_step)
     losses: tuple[Loss, ...] = ()
     if model is not None:
         losses = certify_losses(fleet, members, model, on_step)
         _warn_of_walls(members, limits, on_step)
-    return PlannedFleet(fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits)
+    return PlannedFleet(
+        fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits, tuple(detours.describe())
+    )
 
 
 def certify_separation(

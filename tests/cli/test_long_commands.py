@@ -37,6 +37,7 @@ SMALL_STUDIES = {
     "exports": LINE,
     "faults": f"{LINE} --only radio",
     "fleet-faults": "flights/fleets/two.yaml --flights 2",
+    "fleet-flights": "flights/fleets/two.yaml --flights 2",
     "fleets": "--fleets 1 --size 2 --moments 2",
     "flights": f"{LINE} --repeats 1",
     "giving-way": f"{LINE} --random 1",

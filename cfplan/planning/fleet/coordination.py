@@ -45,7 +45,7 @@ class Blocked(NamedTuple):
     """Why no order was found: where one vehicle is blocked by another."""
 
     pair: tuple[str, str]
-    places: tuple[tuple[float, float], tuple[float, float]]  # m, x and y, of both, at least about
+    places: tuple[tuple[float, float], tuple[float, float]]  # m, x and y, of each of the pair
     time: float  # s after the fleet's start
 
     def __str__(self) -> str:
@@ -185,11 +185,11 @@ class _Search:
             tracks.append(made)
         members = tuple(track.member for track in sorted(tracks, key=lambda track: track.number) if track.member)
         nearest = self._nearest_loss(members, range(len(members)))
-        return members if nearest is None else _blocked_by(nearest)
+        return members if nearest is None else _blocked_by(nearest, members)
 
     def _track(self, number: int, tracks: list[_Track]) -> _Track | Blocked:
         """Return the flight of a vehicle that keeps apart from the tracks of others."""
-        member = self.members[number]
+        member, others = self.members[number], [track.member for track in tracks if track.member]
         blocked: Blocked | None = None
         for slack in SLACKS if self.stops is None else (*SLACKS, *_OFF_PATH_SLACKS):
             clock = self._clock(number, tracks, slack)
@@ -203,7 +203,7 @@ class _Search:
                 continue
             nearest = self._nearest(made, tracks)
             if nearest is not None and not nearest.keeps(self.apart):
-                blocked = _blocked_by(nearest)
+                blocked = _blocked_by(nearest, (made, *others))
                 continue
             near = [
                 self._nearest_loss((made, track.member), (number, track.number)) for track in tracks if track.member
@@ -211,7 +211,7 @@ class _Search:
             lost = min((each for each in near if each), key=lambda each: each.distance, default=None)
             if lost is None:
                 return _Track(number, member.plan.trajectory, None, made)
-            blocked = _blocked_by(lost)
+            blocked = _blocked_by(lost, (made, *others))
         assert blocked is not None
         return blocked
 
@@ -283,9 +283,11 @@ def _distance_at_rest(members: Sequence[FleetMember]) -> float:
     return min((float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(ends, 2)), default=np.inf)
 
 
-def _blocked_by(near: Separation | Loss) -> Blocked:
+def _blocked_by(near: Separation | Loss, members: Sequence[FleetMember]) -> Blocked:
     """Return which pair comes too near, as the reason why a vehicle gets no farther."""
-    return Blocked(near.pair, (near.place, near.place), near.time)
+    at = {member.name: member.columns(np.array([near.time]))[0].tolist() for member in members}
+    (x, y), (other_x, other_y) = (at[name] for name in near.pair)
+    return Blocked(near.pair, ((x, y), (other_x, other_y)), near.time)
 
 
 def _with_clock(member: FleetMember, clock: VehicleClock, apart: float, finish: Finish) -> FleetMember:

@@ -1,4 +1,4 @@
-"""Where no clocks keep two vehicles apart, the path of one that cfplan chooses is led around the other."""
+"""Paths through waypoints are replanned around a vehicle that blocks them."""
 
 import numpy as np
 import pytest
@@ -46,11 +46,12 @@ def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, sh
     for member in fleet.members:
         assert np.allclose(member.plan.path(np.array([0.0, member.plan.path.end])), ENDS[member.name], atol=1e-6)
         straight = np.abs(member.plan.path(np.linspace(0.0, member.plan.path.end, 200))[:, 0]).max() < 1e-6
-        led = f"{member.name} leads around" in steps["coordination"]
-        assert led != straight
-    assert "leads around" in steps["coordination"]
+        assert any(f"the path of {member.name} leads around" in each for each in fleet.detours) != straight
+    assert fleet.detours
+    assert all(detour in steps["coordination"] for detour in fleet.detours)
+    assert list(fleet.detours) == list(fleet.to_dict()["detours"])
 
 
-def test_paths_that_are_given_are_not_led_elsewhere(face_to_face, limits):
+def test_min_snap_paths_are_not_replanned(face_to_face, limits):
     with pytest.raises(InfeasibleError, match=r"0\.35 m apart: .* blocks "):
         plan_fleet(face_to_face(("min-snap", "min-snap")), limits)

@@ -1,0 +1,82 @@
+"""Replan the path of a vehicle around another one where no start delays and clock rates keep the two apart.
+
+A column becomes an obstacle when the path of the blocked vehicle is chosen again. It stands at the other vehicle's
+start, at its end, or where it blocks: the first of these that the path does not clear and that a detour can. If there
+is none, the path of the other vehicle is replanned. Given curves and min-snap paths stay as they are.
+"""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cfplan.errors import CfplanError
+from cfplan.geometry.path import Path
+from cfplan.planning.fleet.coordination import Blocked, Finish
+from cfplan.planning.fleet.fleet_file import FleetFile
+from cfplan.planning.fleet.members import FleetMember
+from cfplan.planning.path.choice import chosen_path
+from cfplan.preparation.plan_flight import FlightOptions, plan_flight
+from cfplan.safety.limits import Limits
+from cfplan.safety.space import Cylinder, Space, distances_beyond, inside
+
+_MAX_COLUMNS = 4  # of a fleet
+_SLACK = 0.05  # m added to the distance to keep, so that start delays and clock rates are found
+
+
+@dataclass(slots=True)
+class Detours:
+    """Replans paths of a fleet around columns, and keeps these."""
+
+    fleet: FleetFile
+    limits: Limits
+    options: FlightOptions
+    finish: Finish | None = None  # applied to each replanned plan
+    columns: dict[int, tuple[Cylinder, ...]] = field(default_factory=dict)  # by the number of the replanned vehicle
+
+    def replan(self, members: Sequence[FleetMember], blocked: Blocked) -> list[FleetMember] | None:
+        """Return the members with one path of a blocked pair replanned; None if neither has a detour."""
+        if sum(map(len, self.columns.values())) >= _MAX_COLUMNS:
+            return None
+        names = [member.name for member in members]
+        for name, other, blocking_place in zip(blocked.pair, blocked.pair[::-1], blocked.places[::-1], strict=True):
+            number, path = names.index(name), members[names.index(other)].plan.path
+            for x, y in (*path(np.array([0.0, path.end]))[:, :2].tolist(), blocking_place):
+                columns = (*self.columns.get(number, ()), self._column(other, x, y))
+                with suppress(CfplanError):
+                    if (member := self._replanned(number, members[number], columns)) is not None:
+                        self.columns[number] = columns
+                        return [*members[:number], member, *members[number + 1 :]]
+        return None
+
+    def describe(self) -> list[str]:
+        """Return one phrase per column."""
+        return [
+            f"the path of {self.fleet.vehicles[number].name} leads around {column.name} at "
+            f"({column.x:.2f}, {column.y:.2f}) m"
+            for number, columns in self.columns.items()
+            for column in columns
+        ]
+
+    def _column(self, name: str, x: float, y: float) -> Cylinder:
+        space = self.limits.space
+        radius = max(self.fleet.apart + _SLACK - space.margin, _SLACK)  # the path keeps the margin from it
+        return Cylinder(x, y, radius, space.low[2], space.high[2], name)
+
+    def _replanned(self, number: int, member: FleetMember, columns: tuple[Cylinder, ...]) -> FleetMember | None:
+        """Return a vehicle on a path around columns; None if its path clears them already, or has no detour."""
+        limits, options = self.limits, self.options
+        space = replace(limits.space, obstacles=(*limits.space.obstacles, *columns))
+        if _clears(member.plan.path, space):
+            return None
+        path_file = self.fleet.vehicles[number].path_file
+        detour, _ = chosen_path(path_file, replace(limits, space=space), budget=options.budget, models=options.models)
+        if not _clears(detour.path, space):
+            return None
+        plan = plan_flight(replace(detour, shape=None), limits, options).plan
+        return replace(member, plan=plan if self.finish is None else self.finish(plan))
+
+
+def _clears(path: Path, space: Space) -> bool:
+    return bool(inside(distances_beyond(path, space)[1]).all())
