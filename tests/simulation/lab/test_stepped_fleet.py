@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fleets_down import assert_all_down
 from septic_flight import septic_payloads
 from stepped_flight import fly_stepped
 
@@ -36,7 +37,6 @@ QUICK = GroundManoeuvres(take_off_height=0.5, take_off_speed=0.6, go_to_speed=0.
 REPOSITORY = Path(__file__).parents[3]
 LIMITS = replace(load_limits(REPOSITORY / "safety.yaml"), ground=QUICK)
 APART = 0.3
-DISARMED = (State.CHECKS_NOT_PASSED, State.CHECKS_PASSED, State.RESET, State.LOCKED, State.CRASHED)
 
 
 def mission(y: float) -> Mission:
@@ -80,15 +80,6 @@ def streaming(fleet, name, moment, act):
     return react
 
 
-def assert_down(flight):
-    """None touched another, and all are on the floor, disarmed, their motors off."""
-    assert not flight.contacts
-    for name, truth in flight.truths.items():
-        assert truth.position[-1, 2] < 0.05, name
-        assert not truth.motor[-1].any(), name
-        assert truth.supervisor[-1] in DISARMED, name
-
-
 def begun(flight):
     return {name: outcome.first_setpoint for name, outcome in flight.outcomes.items()}
 
@@ -104,7 +95,7 @@ def test_a_fleet_starts_together_and_lands(whole_flight):
     assert starts["right"] - starts["left"] == pytest.approx(0.25, abs=0.01)
     assert not whole_flight.brakes
     assert whole_flight.nearest > APART
-    assert_down(whole_flight)
+    assert_all_down(whole_flight)
     for outcome in whole_flight.outcomes.values():
         assert outcome.deviation.max < 0.08
 
@@ -120,7 +111,7 @@ def test_a_lost_link_lets_the_other_brake():
     flight = fleet.fly(streaming(fleet, "left", 0.6, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD))))
     assert flight.exit_codes["left"] is ExitCode.LINK_LOST
     assert "left" in flight.reasons["right"]
-    assert_down(flight)
+    assert_all_down(flight)
     stopped = max(flight.truths["right"].position[:, 0])
     assert stopped < 0.5  # of 0.6: it did not fly to its end
 
@@ -133,7 +124,7 @@ def test_pilots_whose_conductor_dies_brake_and_land():
 
     flight = fleet.fly(streaming(fleet, "left", 0.2, die))
     assert all("silent" in reason for reason in flight.reasons.values())
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 def test_a_pilot_that_stalls_before_its_start_lets_all_brake():
@@ -141,7 +132,7 @@ def test_a_pilot_that_stalls_before_its_start_lets_all_brake():
     stalled = fleet.labs["right"].clock
     flight = fleet.fly(streaming(fleet, "left", 0.1, lambda: stalled.stall(0.24)))
     assert flight.brakes.startswith("right: it began")
-    assert_down(flight)
+    assert_all_down(flight)
     assert max(flight.truths["left"].position[:, 0]) < 0.5
 
 
@@ -156,7 +147,7 @@ def test_all_brake_when_a_short_loss_of_a_link_takes_a_vehicle_off_its_path():
     off = re.match(r"left: it is ([0-9.]+) m beside its place", flight.brakes)
     assert off is not None, flight.brakes
     assert allowed_deviation(APART) + OFF_BY_MORE < float(off[1]) + 0.005 < 0.3
-    assert_down(flight)
+    assert_all_down(flight)
     assert max(max(truth.position[:, 0]) for truth in flight.truths.values()) < 0.5
 
 
@@ -167,7 +158,7 @@ def test_a_vehicle_whose_link_comes_back_lands_where_its_tube_has_been(moment, l
     """From BACK on; that is where the certificate of lost vehicles has it until all rest."""
     fleet = fleet_of()
     flight = fleet.fly(streaming(fleet, "left", moment, lose_link(fleet, lasts)))
-    assert_down(flight)
+    assert_all_down(flight)
     payloads, lost = MISSIONS["left"].payloads, begun(flight)["left"] + moment
     tubes = link_loss_tubes(payloads, LIMITS, round(100 * moment) + np.arange(-2, 3))[-1]
     boxes = tubes[:, round(1000 * BACK / TUBE_PART) :]
@@ -210,7 +201,7 @@ def test_with_one_fault_none_touches_another_and_all_come_down(fault, moment):
     flight = fleet.fly(streaming(fleet, "left", moment, lambda: fault(fleet)))
     assert flight.brakes.startswith("left")
     assert flight.reasons["right"].startswith("the fleet brakes: left")
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 def lose_all_poses(fleet):
@@ -231,7 +222,7 @@ def test_vehicles_beside_a_wall_keep_apart_when_all_poses_are_lost():
     missions = {"left": mission(2.95), "right": mission(3.35)}
     fleet = fleet_of(missions)
     flight = fleet.fly(streaming(fleet, "left", 0.8, lambda: lose_all_poses(fleet)))
-    assert_down(flight)
+    assert_all_down(flight)
     assert nearest_after(flight, begun(flight)["left"]) > APART
 
 
@@ -250,7 +241,7 @@ def test_two_vehicles_whose_poses_all_stop_come_no_nearer_than_certified(two, mo
     fleet = SteppedFleet(missions, Conductor(flights, planned.apart), settings=standing(missions))
     first = min(planned.members, key=lambda each: each.delay).name
     flight = fleet.fly(streaming(fleet, first, moment, lambda: lose_all_poses(fleet)))
-    assert_down(flight)
+    assert_all_down(flight)
     assert "pose" in flight.brakes
     allowed = 2.0 * allowed_deviation(planned.apart)
     assert nearest_after(flight, begun(flight)[first] + moment) > planned.separations[0].distance - allowed
@@ -266,7 +257,7 @@ def test_a_pilot_that_the_order_does_not_reach_brakes_by_itself():
 
     flight = fleet.fly(streaming(fleet, "left", 0.5, lose_both))
     assert "silent" in flight.reasons["right"]
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 @pytest.mark.slow
@@ -281,7 +272,7 @@ def test_a_vehicle_that_does_not_arm_keeps_the_other_on_the_floor():
     flight = fleet.fly(react)
     assert flight.exit_codes["left"] is ExitCode.PREFLIGHT
     assert all(truth.position[:, 2].max() < 0.02 for truth in flight.truths.values())
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 def test_a_link_lost_before_take_off_ends_with_all_disarmed():
@@ -298,7 +289,7 @@ def test_a_link_lost_before_take_off_ends_with_all_disarmed():
     assert "left" in flight.brakes
     assert State.READY_TO_FLY in flight.truths["left"].supervisor
     assert all(truth.position[:, 2].max() < 0.02 for truth in flight.truths.values())
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 @pytest.mark.slow
@@ -310,7 +301,7 @@ def test_swapped_bodies_are_noticed_while_one_vehicle_takes_off():
     assert flight.brakes
     assert flight.truths["right"].position[:, 2].max() < 0.02
     assert flight.truths["left"].position[:, 2].max() < 0.3
-    assert_down(flight)
+    assert_all_down(flight)
 
 
 def test_a_vehicle_among_others_flies_as_one_alone(whole_flight):
@@ -325,7 +316,7 @@ def test_a_vehicle_among_others_flies_as_one_alone(whole_flight):
 def test_a_fleet_flies_on_another_firmware(whole_flight, monkeypatch):
     monkeypatch.setenv("CFPLAN_FIRMWARE", "firmware_doubles:Counting")
     flight = (fleet := fleet_of(delays={"left": 0.0, "right": 0.25})).fly()
-    assert_down(flight)
+    assert_all_down(flight)
     for name, lab in fleet.labs.items():
         assert lab.vehicle.firmware.calls["receive"] > 500
         assert np.array_equal(flight.truths[name].position, whole_flight.truths[name].position)

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fleets_down import assert_all_down
 
 from cfplan.errors import ExitCode
 from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
@@ -18,13 +19,11 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_fleet import SteppedFleet
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from cfplan.simulation.virtual_crazyflie.supervisor import State
 
 pytestmark = pytest.mark.integration
 
 REPOSITORY = Path(__file__).parents[3]
 FOR_GOOD = float("inf")  # s
-DISARMED = (State.CHECKS_NOT_PASSED, State.CHECKS_PASSED, State.RESET, State.LOCKED, State.CRASHED)
 FLEET = """
 vehicles:
   east: {path: line.yaml}
@@ -72,19 +71,11 @@ def columns_apart(flight):
     return float(np.linalg.norm((other - a.position)[flies, :2], axis=1).min())
 
 
-def assert_down(flight):
-    assert not flight.contacts
-    for name, truth in flight.truths.items():
-        assert truth.position[-1, 2] < 0.05, name
-        assert not truth.motor[-1].any(), name
-        assert truth.supervisor[-1] in DISARMED, name
-
-
 def test_paths_that_cross_are_flown_apart(fleet, prepared):
     planned, _ = prepared
     flight = fleet.fly()
     assert set(flight.exit_codes.values()) == {ExitCode.OK}
-    assert_down(flight)
+    assert_all_down(flight)
     begins = {name: outcome.first_setpoint for name, outcome in flight.outcomes.items()}
     delays = {member.name: member.delay for member in planned.members}
     assert begins["north"] - begins["east"] == pytest.approx(delays["north"] - delays["east"], abs=planned.skew)
@@ -100,7 +91,7 @@ def test_all_stop_off_their_paths_no_nearer_than_certified(fleet, prepared, mome
     first = min(planned.members, key=lambda each: each.delay).name
     flight = fly(fleet, first, moment, lambda: fleet.labs[first].orders.give(Order.LAND))
     assert flight.brakes.startswith(first)
-    assert_down(flight)
+    assert_all_down(flight)
     assert columns_apart(flight) > planned.separations[0].distance - 2.0 * allowed_deviation(planned.apart)
 
 
@@ -118,7 +109,7 @@ def test_a_lost_vehicle_stays_in_its_tube_and_the_other_stops_clear_of_it(fleet,
     lab = fleet.labs[lost.name]
     flight = fly(fleet, lost.name, moment, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, lasts)))
     assert flight.brakes.startswith(f"{lost.name}: the vehicle has acknowledged nothing")
-    assert_down(flight)
+    assert_all_down(flight)
     assert columns_apart(flight) > lost_clearance(planned.apart)
     truth, limits = flight.truths[lost.name], missions[lost.name].limits
     since = truth.time - (flight.outcomes[lost.name].first_setpoint + moment)
