@@ -54,7 +54,7 @@ class RealTimeFleetFlight:
     deviation: float = math.nan  # m, of any vehicle from the reference in time, by the poses
     late_p99: float = math.nan  # s, lateness of setpoints, of the worst vehicle
     late_max: float = math.nan  # s
-    nearest: float = math.nan  # m, of two vehicles, at least one in the air, by the poses
+    nearest: float = math.nan  # m, between two vehicles while at least one is in the air, by the poses
 
     @property
     def stop_measured(self) -> bool:
@@ -82,8 +82,8 @@ COLUMNS = (
     Column("late_p99", "late, p99", "ms", ".2f", meaning="of setpoints, of the worst vehicle in the worst flight",
            value=largest("late_p99")),
     Column("late_max", "late, max", "ms", ".2f", value=largest("late_max")),
-    Column("nearest", "nearest", "m", ".2f", meaning="least horizontal distance of two vehicles, of which one "
-           "or both are in the air", value=smallest("nearest")),
+    Column("nearest", "nearest", "m", ".2f", meaning="least horizontal distance between two vehicles while at "
+           "least one is in the air", value=smallest("nearest")),
 )  # fmt: skip
 FAILURE_COLUMNS = (Column("fleet", "fleet"), Column("number", "flight", "", "d"), Column("reason", "ended"))
 
