@@ -17,7 +17,7 @@ endef
 PYTEST := $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile
 PROCESSORS := own older plain mixed
 
-.PHONY: install fly test test-processors slow fuzz dist release site pictures lint clean
+.PHONY: install fly test test-processors slow slow-stepped fuzz dist release site pictures lint clean
 
 install: $(VENV)/installed
 
@@ -45,8 +45,12 @@ test-as-%: $(VENV)/installed-tests
 	$(BIN)/python -m tests.processors $* $(BIN)/cfplan doctor --warm-up
 	$(BIN)/python -m tests.processors $* $(PYTEST) --ignore tests/preparation/test_planner_process.py
 
-slow: $(VENV)/installed-tests
-	$(BIN)/python -m pytest -m slow
+slow: slow-stepped
+	$(BIN)/python -m pytest -m slow -k in_real_time
+
+# Those of the slow tests that do not go by the computer's clock.
+slow-stepped: $(VENV)/installed-tests
+	$(PYTEST) -m slow -k "not in_real_time"
 
 fuzz: $(VENV)/installed-tests
 	$(BIN)/python -m pytest -m "hypothesis and not slow" --hypothesis-profile=random

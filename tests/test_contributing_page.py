@@ -32,6 +32,7 @@ def example(name):
     return names
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_the_planner_of_the_page_plans_a_certified_flight(tmp_path):
     """In a copy of the package, with the rows that the page shows; it is not compiled, as nothing can be kept."""

@@ -209,6 +209,7 @@ print(float(total(kind(5))), float(total(kind(3))), sum(total.stats.cache_hits.v
 KINDS = ("int8", "int16", "int32", "int64")
 
 
+@pytest.mark.slow
 def test_of_processes_that_compile_at_once_each_keeps_its_own(cache, tmp_path):
     (tmp_path / "kept.py").write_text(KEPT_BEFORE)
 

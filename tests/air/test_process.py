@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import psutil
 import pytest
+from slow_cases import slow_unless
 from waiting import PATIENCE, a_moment, until
 
 from cfplan.air.core import NO_ANSWER, NOT_FLOWN, ON_ITS_WAY
@@ -235,7 +236,7 @@ def test_an_answer_that_comes_late_leaves_both_sides_with_the_same_commitment(bo
     assert all(isinstance(answer, Commitment) for answer in pilot.given)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("how", slow_unless([signal.SIGSTOP], [signal.SIGKILL, signal.SIGSTOP]))
 def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(both, held, how):
     planner, pilot = both
     begin(planner, pilot)
@@ -297,7 +298,7 @@ def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):
     assert until(replaced_from_near)  # on a busy computer the vehicle may have arrived meanwhile
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("how", slow_unless([signal.SIGKILL], [signal.SIGKILL, signal.SIGTERM]))
 def test_plans_are_checked_all_the_same_where_the_process_beside_the_planner_has_died(both, how):
     planner, pilot = both
     begin(planner, pilot)
@@ -308,7 +309,7 @@ def test_plans_are_checked_all_the_same_where_the_process_beside_the_planner_has
         assert answer.verdict is PathVerdict.ACCEPTED, answer
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize("how", slow_unless([signal.SIGTERM], [signal.SIGKILL, signal.SIGTERM]))
 def test_nothing_of_a_planner_that_was_killed_goes_on(both, how):
     planner, _ = both
     beside = psutil.Process(planner.process_id).children()

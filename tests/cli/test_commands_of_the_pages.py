@@ -44,6 +44,8 @@ ON_HARDWARE = (("radio://0/80/2M/E7E7E7E7E7", "sim://0"), ("vicon://192.168.1.2/
 SLOW = (
     "/scan.yaml", "/circle.yaml --to", "--gif", "--png", "replay records/20261122-212927-figure-eight --figure",
     "--on-board", "fly flights/identify.yaml", "--warm-up", "/six.yaml", "export flights/fleets",
+    "fly flights/figure8.yaml", "fly mine.parquet", "fly path.yaml", "--speed 0.3", "--figure plan.pdf",
+    "export mylab/first.yaml", "-o comparison.html",
 )  # fmt: skip
 DRIVERS = [*Path("/usr/share/vulkan/icd.d").glob("lvp_icd*.json"), *Path("/etc/vulkan/icd.d").glob("lvp_icd*.json")]
 no_driver = pytest.mark.skipif(not DRIVERS, reason="no software Vulkan driver (Debian: mesa-vulkan-drivers)")

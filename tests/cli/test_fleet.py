@@ -120,6 +120,7 @@ def test_a_fleet_is_rehearsed(cfplan, fleet_file, safety_file):
     assert "Dry runs" in ended.out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["crazyswarm", "memory", "compressed"])
 def test_polynomials_of_a_fleet_that_are_started_together_keep_apart(export, form):
     document, folder = export(form)

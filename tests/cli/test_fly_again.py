@@ -108,6 +108,7 @@ def require_improvement(figures, first, fraction):
     assert all(flown["travel_time_flown"] is not None for flown in figures)  # each arrived at the plan's end
 
 
+@pytest.mark.slow
 def test_the_second_flight_stays_nearer_to_the_plan_and_the_third_no_farther(patched, cfplan, tmp_path, without_moment):
     words = REPOSITORY / "flights" / "figure8.yaml", "--safety", without_moment
     figures, (first, second, third) = fly_three_times(cfplan, tmp_path / "records", *words)

@@ -310,8 +310,9 @@ def world() -> World:
 
 
 @pytest.fixture
-def mission() -> Mission:
-    payloads = make_payloads()
+def mission(request: pytest.FixtureRequest) -> Mission:
+    """A mission at a height of 1 m, or that of the parameter."""
+    payloads = make_payloads(height=getattr(request, "param", 1.0))
     return Mission(payloads, encode_stops(decode(payloads), 100.0), make_limits())
 
 

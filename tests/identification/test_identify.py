@@ -100,6 +100,7 @@ def test_motion_is_the_same_if_mass_thrust_drag_and_inertia_all_grow():
     np.testing.assert_allclose(states[0][:13], states[1][:13], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_several_records_are_surer_than_one(record, drawn, found):
     both = identify([record, record], mass=drawn.airframe.mass)
     assert both.quantities["drag"].deviation < found.quantities["drag"].deviation

@@ -18,7 +18,11 @@ pytestmark = pytest.mark.integration
 
 @pytest.mark.parametrize(
     ("path", "after"),
-    [*(("slalom", after) for after in (0.0005, 0.0025, 0.0045, 0.0065, 0.0075, 0.0085)), ("random", 0.0075)],
+    [
+        ("slalom", 0.0075),
+        ("random", 0.0075),
+        *(pytest.param("slalom", after, marks=pytest.mark.slow) for after in (0.0005, 0.0025, 0.0045, 0.0065, 0.0085)),
+    ],
 )
 def test_flights_stay_near_their_plan_whatever_the_beat_of_the_filter(limits, monkeypatch, tmp_path, path, after):
     """The filter predicts every 10 ms, and setpoints and poses are sent `after` s later: that is worth 5 ms.

@@ -38,7 +38,6 @@ REPOSITORY = Path(__file__).parents[2]
 PAGE = (REPOSITORY / "docs" / "export.md").read_text()
 FLIGHTS = sorted(file.stem for file in (REPOSITORY / "flights").glob("*.yaml"))
 TOO_LONG = ("lissajous", "scan")  # for the 31 pieces that Crazyswarm uploads
-QUICK = ("line",)
 FLIGHTS_EACH = 5  # a single one strays by chance half a centimetre more than another
 COARSELY = {("identify", "by_crazyswarm"): 0.03}  # m: 31 raw pieces follow its 30 s to 17 mm, and leave no correction
 WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed
@@ -227,10 +226,11 @@ def streamed(name: str) -> float:
     return statistics.fmean(streamed_deviation(planned(name), seed) for seed in range(FLIGHTS_EACH))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "fly", "form"),
     [
-        pytest.param(name, fly, form, marks=[pytest.mark.slow] * (name not in QUICK), id=f"{name} {fly.__name__}")
+        pytest.param(name, fly, form, id=f"{name} {fly.__name__}")
         for fly, form in ((by_cflib, Form.MEMORY), (by_crazyswarm, Form.CRAZYSWARM))
         for name in FLIGHTS
         if (name, fly) not in [(name, by_crazyswarm) for name in TOO_LONG]

@@ -48,6 +48,7 @@ def test_gaps_that_lose_the_vehicle_in_the_lab_lose_it_in_the_simulation(loop):
         assert found.lost[0, round(moment * RATE)] == (rung is Rung.CUT), moment
 
 
+@pytest.mark.slow
 def test_the_plan_of_that_loop_as_it_is_now_loses_no_drawn_vehicle_at_its_worst_moments():
     limits = load_limits(REPOSITORY / "safety.yaml")
     mission = prepare_mission(REPOSITORY / "flights" / "loop3d.yaml", limits)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from slow_cases import slow_unless
 from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, InfeasibleError, InputError, PreflightError
@@ -32,19 +33,17 @@ WORSE = 0.02  # m, by which the deviation may be larger than that of the same pl
 BY_NAME = {scenario.name: scenario for scenario in SCENARIOS}
 NO_STREAM = ("stream stalled for 0.6 s",)  # which it does without
 FLIGHTS = sorted(file.stem for file in (REPOSITORY / "flights").glob("*.yaml"))
-QUICK = (
-    "poses stop for 0.3 s",
-    "poses stop for 5 s",
-    "radio loses 50 %",
-    "radio dead for 3 s",
-    "radio dead for 3 s while taking off",
-    "space bar in the stream",
-    "space bar while landing",
-    "Esc in the stream",
-    "pilot killed",
-    "locked between arming and take-off",
-    "two bodies swapped",
-)
+FAULTS = [scenario for scenario in SCENARIOS if not scenario.planner]
+QUICK = [
+    BY_NAME[name]
+    for name in (
+        "poses stop for 5 s",
+        "radio dead for 3 s while taking off",
+        "space bar in the stream",
+        "pilot killed",
+        "two bodies swapped",
+    )
+]
 
 pytestmark = pytest.mark.integration
 
@@ -95,9 +94,7 @@ def test_no_setpoint_is_sent_in_the_air(line):
     assert (Port.HIGH_LEVEL, 0) in heads
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in ("line", "figure8") else pytest.mark.slow) for name in FLIGHTS]
-)
+@pytest.mark.parametrize("name", slow_unless(["line"], FLIGHTS))
 def test_it_is_nearly_on_the_plan_that_a_stream_flies(name):
     on_board, streamed = compared(prepared_of(name))
     print(f"{name}: {100 * on_board:.1f} cm on board, {100 * streamed:.1f} cm streamed")
@@ -162,7 +159,7 @@ def test_a_vehicle_that_stands_too_near_to_a_wall_stays_down(line):
     assert "fall after link loss" in flight.outcome.reason
 
 
-@pytest.mark.parametrize("share", [0.2, 0.35, 0.5, 0.65, 0.8])
+@pytest.mark.parametrize("share", slow_unless([0.35, 0.8], [0.2, 0.35, 0.5, 0.65, 0.8]))
 def test_a_dead_link_ends_inside_the_walls_and_where_the_fall_was_foreseen(line, share):
     lab = SteppedLab(LIMITS.airframe)
     row = int(share * len(line.mission.payloads))
@@ -218,14 +215,7 @@ def test_a_silent_log_lands_it_by_its_commander(line, kind):
     assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
 
 
-@pytest.mark.parametrize(
-    "scenario",
-    [
-        pytest.param(row, id=row.name, marks=[] if row.name in QUICK else pytest.mark.slow)
-        for row in SCENARIOS
-        if not row.planner
-    ],
-)
+@pytest.mark.parametrize("scenario", slow_unless(QUICK, FAULTS), ids=lambda row: row.name)
 def test_a_fault_comes_to_its_rung_and_the_vehicle_to_the_ground(scenario, line):
     flown = fly_scenario(scenario, line.mission)
     expected = "none" if scenario.name in NO_STREAM else flown.expected

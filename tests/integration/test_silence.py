@@ -4,6 +4,7 @@ import itertools
 from pathlib import Path
 
 import pytest
+from slow_cases import slow_unless
 
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
@@ -17,7 +18,8 @@ from studies.faults import fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 MOMENTS = {Phase.TAKE_OFF: 0.9, Phase.GO_TO_START: 0.5, Phase.STREAM: 1.5, Phase.HOLD: 0.2, Phase.LAND: 0.3}  # s
-ESTIMATE, STATUS = VehicleFaultKind.SILENT_ESTIMATE, VehicleFaultKind.SILENT_STATUS
+PHASES = slow_unless([Phase.TAKE_OFF, Phase.STREAM], MOMENTS)
+BOTH = ESTIMATE, STATUS = VehicleFaultKind.SILENT_ESTIMATE, VehicleFaultKind.SILENT_STATUS
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +36,8 @@ def assert_down(flown):
     assert (flown.landed, flown.disarmed, flown.readable) == (True, True, True)
 
 
-@pytest.mark.parametrize("phase", MOMENTS)
-@pytest.mark.parametrize("logs", [(ESTIMATE,), (STATUS,), (ESTIMATE, STATUS)])
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("logs", slow_unless([BOTH], [(ESTIMATE,), (STATUS,), BOTH]))
 @pytest.mark.parametrize("poses", [True, False])
 def test_a_vehicle_that_acknowledges_lands_whatever_is_silent(line, phase, logs, poses):
     faults = [VehicleFault(log, 0.0, FOR_GOOD) for log in logs]
@@ -49,8 +51,8 @@ def test_a_vehicle_that_acknowledges_lands_whatever_is_silent(line, phase, logs,
         assert flown.off_plan < 0.1
 
 
-@pytest.mark.parametrize("phase", MOMENTS)
-@pytest.mark.parametrize("logs", [(ESTIMATE,), (STATUS,), (ESTIMATE, STATUS)])
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("logs", slow_unless([BOTH], [(ESTIMATE,), (STATUS,), BOTH]))
 def test_logs_that_come_back_for_a_moment_change_nothing(line, phase, logs):
     spans = ((0.0, 0.7), (0.8, FOR_GOOD))
     flown = fly_silenced(line, phase, *(VehicleFault(log, *span) for log, span in itertools.product(logs, spans)))
@@ -59,18 +61,15 @@ def test_logs_that_come_back_for_a_moment_change_nothing(line, phase, logs):
     assert flown.off_plan < 0.1
 
 
-@pytest.mark.parametrize("phase", MOMENTS)
+@pytest.mark.parametrize("phase", PHASES)
 @pytest.mark.parametrize("kind", [RadioFaultKind.DEAD, RadioFaultKind.UNACKNOWLEDGED])
-@pytest.mark.parametrize(
-    "silent",
-    [(ESTIMATE, STATUS), *(pytest.param(logs, marks=pytest.mark.slow) for logs in [(), (ESTIMATE,), (STATUS,)])],
-)
+@pytest.mark.parametrize("silent", slow_unless([BOTH], [(), (ESTIMATE,), (STATUS,), BOTH]))
 def test_a_vehicle_whose_uplink_is_gone_ends_by_link_loss_inside(line, phase, kind, silent):
     faults = (VehicleFault(log, 0.0, FOR_GOOD) for log in silent)
     assert_down(fly_silenced(line, phase, RadioFault(kind, 0.0, FOR_GOOD), *faults))
 
 
-@pytest.mark.parametrize("phase", MOMENTS)
+@pytest.mark.parametrize("phase", PHASES)
 @pytest.mark.parametrize("kind", [RadioFaultKind.DEAD, RadioFaultKind.UNACKNOWLEDGED])
 def test_an_uplink_and_poses_that_are_both_gone_end_by_link_loss_inside(line, phase, kind):
     assert_down(fly_silenced(line, phase, RadioFault(kind, 0.0, FOR_GOOD), ViconFault(FaultKind.STALL, 0.0, FOR_GOOD)))

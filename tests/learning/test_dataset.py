@@ -277,6 +277,7 @@ def test_a_cluster_without_workers_or_with_threads_is_refused(workers, reason):
     assert f"dask worker --nworkers -1 --nthreads 1 {cluster.scheduler_address}" in error.value.hint
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_a_cluster_makes_the_same_bytes_also_when_a_worker_is_killed(made, tmp_path):
     distributed = pytest.importorskip("distributed", reason="the extra `cluster` is not installed")

@@ -178,6 +178,7 @@ def test_the_loss_knows_the_error_of_time():
     assert float(value) == pytest.approx(1e-4 + (math.exp(0.01) - 1) ** 2, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_two_processes_train_one_model(tiny, tmp_path):
     command = [

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from slow_cases import slow_unless
 
 import cfplan
 from cfplan.air.requests import PathVerdict, Wish
@@ -209,7 +210,7 @@ def test_the_latest_request_wins(flown):
     assert vehicle.answers() == []
 
 
-@pytest.mark.parametrize("fault", [*PlannerFault])
+@pytest.mark.parametrize("fault", slow_unless([PlannerFault.LATE], PlannerFault))
 def test_whatever_is_wrong_with_the_planner_the_vehicle_flies_what_is_committed(flown, fault):
     vehicle, flight = flown
     vehicle.fly([[1, 0, 1], [0, 1, 1.2]])
@@ -222,7 +223,7 @@ def test_whatever_is_wrong_with_the_planner_the_vehicle_flies_what_is_committed(
     assert all(answer.verdict is not PathVerdict.ACCEPTED for answer in vehicle.answers() if answer.number == number)
 
 
-@pytest.mark.parametrize("fault", [*PlannerFault])
+@pytest.mark.parametrize("fault", slow_unless([PlannerFault.GARBAGE, PlannerFault.STOPPED], PlannerFault))
 def test_a_planner_that_fails_before_all_of_a_plan_is_committed_leaves_it_to_the_stop_behind_what_is(flown, fault):
     """It rests on the plan; where the planner can plan again, it goes on from there, or says that it will not.
 
@@ -290,6 +291,7 @@ def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
         assert vehicle.outcome is None
 
 
+@pytest.mark.slow
 def test_a_take_off_that_takes_too_long_has_landed_when_it_raises(limits):
     slow = replace(limits, ground=replace(limits.ground, take_off_speed=0.004))
     flight = SteppedSteering(slow)
@@ -301,6 +303,7 @@ def test_a_take_off_that_takes_too_long_has_landed_when_it_raises(limits):
         assert not flight.lab.truth().motor[-1].any()
 
 
+@pytest.mark.slow
 def test_landing_raises_if_the_flight_does_not_end(flown, monkeypatch):
     vehicle, flight = flown
     monkeypatch.setattr(flight, "order", lambda _: None)

@@ -22,6 +22,7 @@ def result(tmp_path_factory):
     return run_study("exports", "studies.exports", STUDY, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["exports", "on-board"])
 def test_on_board_it_strays_little_more_than_streamed(result, name):
     (row,) = result.table(name).rows

@@ -50,6 +50,7 @@ def test_with_the_dry_runs_body_it_is_the_dry_runs_flight(path_file):
     np.testing.assert_array_equal(positions, loop.position[::2])
 
 
+@pytest.mark.slow
 def test_rotorpy_and_the_dry_run_are_a_centimetre_apart_at_most(result):
     flights = [flight for flight in result.rows if flight.body.startswith("RotorPy")]
     assert [flight.motor_lag for flight in flights] == [REALISTIC_LAG, PAPER_LAG]

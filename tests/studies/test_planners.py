@@ -51,6 +51,7 @@ def test_a_run_is_reproduced_by_its_seed_but_for_times(small):
     assert [t.certified_time for t in run(SMALL).rows] == [t.certified_time for t in small.rows]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "changes",
     [
@@ -67,6 +68,7 @@ def test_each_workload_has_its_groups(changes):
     assert all(trial.certified for trial in result.rows)
 
 
+@pytest.mark.slow
 def test_hard_paths_are_answered():
     (answers,) = run(Settings(Workload.HARD, paths=1, first_seed=5)).tables
     *families, every = answers.rows

@@ -40,6 +40,7 @@ def test_random_requests_are_flown_or_refused_within_every_limit(flown):
     assert flight.to_wall > 0.0
 
 
+@pytest.mark.slow
 def test_the_study_flies_the_same_by_the_same_seed(flown):
     result = run_study("steering", "studies.steering", STUDY, Settings(flights=1, requests=14, seconds=8.0, seed=4))
     (row,) = result.rows

@@ -56,6 +56,7 @@ def loop(limits):
     return planned, fit_polynomials(planned, Form.MEMORY)
 
 
+@pytest.mark.slow
 def test_the_loop_is_flown_on_board_nearly_as_by_stream(loop, limits):
     planned, exported = loop
     plan = planned.plan.trajectory

@@ -383,6 +383,17 @@ def test_without_poses_and_estimates_the_motors_stop_where_the_setpoint_is_benea
     assert world.motors_off_since - dict(outcome.phases)[Phase.HOLD] < 3.0
 
 
+@pytest.mark.parametrize("mission", [6.0], indirect=True)
+def test_without_poses_the_motors_stop_after_three_seconds_at_any_height(world, fly, mission):
+    world.when(Phase.HOLD, 0.0, lambda: stop_poses(world))
+    world.parameters["kalman.maxPos"] = 10.0
+    outcome = fly(space=replace(mission.limits.space, high=(3.0, 3.0, 8.0)))
+    assert outcome.rung is Rung.LAND
+    assert "touchdown is not confirmed" in world.said
+    assert world.motors_off_since - dict(outcome.phases)[Phase.HOLD] == pytest.approx(3.0, abs=0.05)
+    assert world.position[2] > 1.0
+
+
 def test_a_pose_from_before_a_stream_is_not_judged_by_it(world, fly):
     world.when(Phase.GO_TO_START, 0.05, lambda: stop_poses(world))
     outcome = fly()

@@ -223,6 +223,7 @@ def colours(picture):
     return len(Image.open(io.BytesIO(picture)).convert("RGB").getcolors(maxcolors=1 << 24))
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 @needs_driver
 def test_every_view_renders_without_reports_and_is_not_blank(rrd_with_plan):

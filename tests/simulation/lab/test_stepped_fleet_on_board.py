@@ -71,6 +71,7 @@ def columns_apart(flight):
     return float(np.linalg.norm((other - a.position)[flies, :2], axis=1).min())
 
 
+@pytest.mark.slow
 def test_paths_that_cross_are_flown_apart(fleet, prepared):
     planned, _ = prepared
     flight = fleet.fly()

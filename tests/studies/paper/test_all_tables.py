@@ -30,6 +30,7 @@ def test_what_was_made_of_the_present_sources_is_kept(made):
     assert again.result.seconds > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["sources", "settings", "interrupted"])
 def test_a_result_of_other_sources_or_settings_or_an_unfinished_one_is_made_anew(made, change, tmp_path):
     result = read_result(made / "yaw-consistency.json")

@@ -47,6 +47,7 @@ def test_what_the_paper_prints_is_consistent_where_it_prints_twice():
     assert all(each != pytest.approx(ABOVE_IN_TEXT) for each in above)  # as the documentation says
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "settings", "planners"),
     [

@@ -37,6 +37,7 @@ def quick():
     return run_study("hardware", "studies.paper.hardware", STUDY, Settings(paths=1, quick=True))
 
 
+@pytest.mark.slow
 def test_every_planner_flies_certified_and_all_but_the_one_that_ships_as_planned(quick):
     rows = quick.table("hardware").rows
     assert [(row["way"], row["planner"]) for row in rows] == [

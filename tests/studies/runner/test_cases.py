@@ -153,6 +153,7 @@ def test_a_result_survives_its_file_and_its_rows_lie_beside_it(tmp_path):
     assert [row["value"] for row in rows] == [0.0, 1.0, 4.0, 9.0]
 
 
+@pytest.mark.slow
 def test_a_killed_study_goes_on_from_where_it_was(tmp_path):
     out = tmp_path / "runs.json"
     command = [sys.executable, "-m", "studies", "dry-runs", "-o", str(out), *(f"flights/{name}.yaml" for name in

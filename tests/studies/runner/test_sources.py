@@ -41,15 +41,17 @@ def unchanged(copy):
     [
         ("cfplan/simulation/dry_run.py", "", "\n_UNUSED = 1\n", True),  # imported by the study
         ("cfplan/vehicle/flatness.py", "", "\n_UNUSED = 1\n", True),  # imported by what the study imports
-        ("safety.yaml", "", "\n# a word\n", True),
         ("cfplan/simulation/dry_run.py", "", "\n# a word\n", False),
-        ("studies/dry_runs.py", '"""Fly', '"""Do fly', False),
-        ("cfplan/__init__.py", "", "\n_UNUSED = 1\n", False),  # lists what programs may ask for
-        (
+        pytest.param("safety.yaml", "", "\n# a word\n", True, marks=pytest.mark.slow),
+        pytest.param("studies/dry_runs.py", '"""Fly', '"""Do fly', False, marks=pytest.mark.slow),
+        # It lists what programs may ask for.
+        pytest.param("cfplan/__init__.py", "", "\n_UNUSED = 1\n", False, marks=pytest.mark.slow),
+        pytest.param(
             "cfplan/preparation/plan_flight.py",
             "if TYPE_CHECKING:\n",
             "if TYPE_CHECKING:\n    import cfplan.cli\n",
             False,
+            marks=pytest.mark.slow,
         ),
         ("studies/steering.py", "", "\n_UNUSED = 1\n", False),  # another study
     ],
