@@ -34,6 +34,7 @@ from cfplan.vehicle.airframes import AIRFRAMES
 
 ARMED, CAN_FLY, FLYING, LOCKED = 1 << 1, 1 << 3, 1 << 4, 1 << 6
 LEVEL = (0.0, 0.0, 0.0, 1.0)
+LONGEST_STEP = 0.04  # m from one setpoint to the next, at 4 m/s
 
 
 def make_limits() -> Limits:
@@ -226,8 +227,14 @@ class World:
             return
         self.motors_on = True
         state = decode(np.frombuffer(packet[1:], dtype=np.uint8))
-        (x, y, z), self._asked = state.position[0].tolist(), tuple(state.velocity[0].tolist())
+        x, y, z = self._towards(state.position[0])
+        self._asked = tuple(state.velocity[0].tolist())
         self.position = x, y if self.push is None else self.position[1], max(z, self.floor)
+
+    def _towards(self, place: np.ndarray) -> list[float]:
+        """Return where the vehicle is next on its way to a place, m: it catches up where setpoints went ahead of it."""
+        way = place - self.position
+        return (self.position + way * min(1.0, LONGEST_STEP / max(float(np.linalg.norm(way)), 1e-9))).tolist()
 
     def send_pose(self, position, quaternion) -> None:
         self.forwarded.append((self.now, *position))

@@ -15,8 +15,7 @@ CELLS = [Health(*cell) for cell in itertools.product(Freshness, repeat=4)]
 FOR_GOOD = [cell for cell in CELLS if LATE not in (cell.uplink, cell.poses, cell.estimate, cell.status)]
 ONE_LATE = [Health(**{source: LATE}) for source in SILENT]
 LATE_FOR = 0.35  # s
-# s; early where a vehicle that hears nothing soon lags far behind its setpoint
-MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1, Phase.LAND: 0.05}
+MOMENT = dict.fromkeys(Phase, 0.3) | {Phase.STREAM: 0.1}  # s; early in the stream, where it is slow and lags little
 
 
 def silence(world, source, phase, spans):
