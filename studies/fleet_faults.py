@@ -116,6 +116,7 @@ class FleetMissions:
     """A fleet, planned and ready to fly."""
 
     apart: float  # m
+    skew: float  # s
     flights: tuple[ConductedFlight, ...]
     missions: Mapping[str, Mission]
     keeps_lost: bool  # the plans also keep clear of a lost vehicle
@@ -219,7 +220,7 @@ def prepare_missions(file: Path) -> FleetMissions:
     missions = {each.planned.name: each.mission for each in prepare_fleet(planned)}
     flights = tuple(ConductedFlight(each.name, missions[each.name].start[0], each.delay) for each in planned.members)
     keeps_lost = all(each.keeps(planned.lost_keep) for each in planned.losses)
-    return FleetMissions(planned.apart, flights, missions, keeps_lost)
+    return FleetMissions(planned.apart, planned.skew, flights, missions, keeps_lost)
 
 
 def random_fault(seed: int, missions: Mapping[str, Mission]) -> FleetFault:
@@ -266,7 +267,10 @@ def fly_with_fault(seed: int, fleets: Mapping[str, FleetMissions]) -> FaultyFlee
     fleet = fleets[name]
     fault = random_fault(seed, fleet.missions)
     lab = SteppedFleet(
-        fleet.missions, Conductor(fleet.flights, fleet.apart), settings=_standing(fleet.missions, seed), seed=seed
+        fleet.missions,
+        Conductor(fleet.flights, fleet.apart, fleet.skew),
+        settings=_standing(fleet.missions, seed),
+        seed=seed,
     )
     with tempfile.TemporaryDirectory() as folder:
         flown = _recorded(lab, fault, fleet, Path(folder))

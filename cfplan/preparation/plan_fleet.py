@@ -21,6 +21,7 @@ from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
 from cfplan.planning.fleet.lost import Loss, LossModel, Tube
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.fleet.separation import CLEAR, Separation, Stops, allowed_deviation, separations, stop_separations
+from cfplan.planning.plan import check_endurance
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.detours import Detours
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
@@ -217,6 +218,7 @@ def coordinate_fleet(
         results.append(f"{end:.2f} s together; the slowest vehicle alone takes {longest:.2f} s")
         results += detours.describe()
         results.append(f"waiting at the start: {waiting}, slowed: {slower}")
+    _check_endurance(members, limits)
     found = certify_separation(fleet, members, stops, on_step)
     losses: tuple[Loss, ...] = ()
     if model is not None:
@@ -225,6 +227,16 @@ def coordinate_fleet(
     return PlannedFleet(
         fleet.name, fleet.apart, fleet.skew, members, found, losses, longest, limits, tuple(detours.describe())
     )
+
+
+def _check_endurance(members: Sequence[FleetMember], limits: Limits) -> None:
+    """Raise InfeasibleError if a vehicle that hovers until all have taken off and it begins flies for too long."""
+    queue = (len(members) - 1) * limits.ground.take_off_height / limits.ground.take_off_speed
+    for member in members:
+        try:
+            check_endurance(queue + member.end, limits)
+        except InfeasibleError as error:
+            raise InfeasibleError(f"{member.name}: {error.what}", where=error.where, hint=error.hint) from None
 
 
 def certify_separation(
@@ -314,10 +326,14 @@ def lost_clearance(apart: float) -> float:
 
 def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
     """Return where the vehicles of a fleet go when they are lost, and how they stop."""
+    deviation = allowed_deviation(fleet.apart)
 
     def tube(plan: Plan) -> Tube:
         payloads = encode_flight(PlannedFlight("", plan, limits)).payloads
-        return Tube(link_loss_tubes(payloads, limits, np.arange(len(payloads))), RATE, 0.001 * TUBE_PART)
+        boxes = link_loss_tubes(payloads, limits, np.arange(len(payloads)))
+        boxes[..., 0, :2] -= deviation
+        boxes[..., 1, :2] += deviation
+        return Tube(boxes, RATE, 0.001 * TUBE_PART)
 
     stop = stop_clock(RATE)[0] / RATE
     return LossModel(once_per_plan(tube), stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))

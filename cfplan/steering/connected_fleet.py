@@ -140,7 +140,7 @@ class ConnectedFleet:
         flights = [
             ConductedFlight(each.name, each.prepared.mission.start[0], each.member.delay) for each in self.vehicles
         ]
-        self._conductor = Conductor(flights, self.plan.apart, holds=True)
+        self._conductor = Conductor(flights, self.plan.apart, self.plan.skew, holds=True)
 
     def _start_pilots(self, addresses: dict[str, VehicleAddress]) -> dict[str, PilotProcess]:
         """Start the processes of shared dongles and then the pilots, so that the dongles' processes end last."""

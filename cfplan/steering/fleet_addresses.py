@@ -23,6 +23,8 @@ from cfplan.preparation.steps import OnStep, step
 from cfplan.safety.limits import PoseLimits
 from cfplan.steering.starting_vehicle import SIMULATED, look_at_hardware
 
+_NOT_IN_BODIES = "/?#%"  # separate or encode the parts of a motion capture system's URI
+
 
 @dataclass(frozen=True, slots=True)
 class VehicleAddress:
@@ -58,6 +60,13 @@ def fleet_addresses(fleet: FleetFile, mocap: str | None, *, on_board: bool = Fal
     bodies = {vehicle.name: vehicle.body or vehicle.name for vehicle in fleet.vehicles}
     for uri in uris.values():
         check_vehicle_uri(uri)
+    for name, body in bodies.items():
+        if found := sorted(set(body) & set(_NOT_IN_BODIES)):
+            raise InputError(
+                f"the body of {name}, {body!r}, has {' and '.join(found)} in its name",
+                where=fleet.name,
+                hint="rename it in motion capture, and write its name as `body`",
+            )
     _require_all_virtual_or_none(fleet, mocap)
     _require_different("address", uris, fleet)
     _require_different("body", bodies, fleet)

@@ -67,6 +67,7 @@ def fly(cfplan, safety_file, tmp_path, monkeypatch):
         (radio(0, "01"), radio(1, "02"), ["--mocap", "vicon://10.0.0.1/a"], 2, "cannot be that of every"),
         (radio(0, "01"), radio(1, "02"), ["--mocap", "video://10.0.0.1"], 2, "unknown motion capture"),
         ("", "", MOCAP, 2, "have a virtual Vicon"),
+        ("body: 'a#1'", "", [], 2, "the body of a, 'a#1', has # in its name"),
         (radio(0, "01"), radio(1, "02"), SEEN, 8, "no Crazyradio is plugged in"),
         ("uri: 'udp://127.0.0.1:19850'", "uri: 'udp://127.0.0.1:19851'", SEEN, 2, "no body named 'b'"),
     ],

@@ -88,7 +88,7 @@ def fly_two(react=lambda name, message, pids: None, *, dongle: bool = False):
             )
             for place in places
         ]  # fmt: skip
-        conductor = Conductor([pilot.flight for pilot in pilots], 0.3)
+        conductor = Conductor([pilot.flight for pilot in pilots], 0.3, 0.03)
         outcome = fly_together(
             pilots, conductor, listen=lambda name, message: react(name, message, pids), keyboard=keyboard
         )

@@ -1,12 +1,14 @@
 """Fleets are rehearsed: what a vehicle deviates by must fit into the distance that the fleet keeps."""
 
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from cfplan.errors import NotCertifiedError
+from cfplan.errors import InfeasibleError, NotCertifiedError
+from cfplan.flight.setpoints.encoding import RATE
 from cfplan.geometry.min_snap import min_snap
 from cfplan.planning.fleet.fleet_file import FleetFile
 from cfplan.planning.fleet.members import FleetMember
@@ -86,6 +88,27 @@ def test_each_pair_must_keep_apart_on_its_paths_and_in_its_stops(limits):
     assert [each.distance for each in found] == pytest.approx([0.3, 0.45, 0.8], abs=0.06)
     with pytest.raises(NotCertifiedError, match=r"at 0 and at 1 .*when all brake"):
         certify_separation(replace(fleet, apart=0.35), members, lambda planned: of_plan[id(planned)])
+
+
+def test_a_tube_contains_vehicles_that_are_as_far_off_their_path_as_allowed_when_they_are_lost(line, limits):
+    apart = 0.33
+    boxes = loss_model(FleetFile("row", (), apart, SKEW), limits).tube(line).boxes
+    times = np.minimum(np.arange(boxes.shape[1]) / RATE, line.trajectory.duration)
+    y, off = line.trajectory.at(times).position[:, 1], (apart - CLEAR) / 2.0 - 1e-9
+    for way in boxes[:, :, 0, :, 1]:  # its motors stop at once, or it flies on
+        assert (way[:, 0] <= y - off).all()
+        assert (way[:, 1] >= y + off).all()
+
+
+def test_a_vehicle_that_hovers_until_all_have_taken_off_must_not_fly_longer_than_its_battery_lasts(line, limits):
+    ground, height = limits.ground, limits.space.high[2] - limits.space.low[2]
+    alone = line.trajectory.duration + height / ground.take_off_speed + height / ground.land_speed
+    apart = plan(min_snap([[-0.6, 2.0, 1.0], [0.6, 2.0, 1.0]]), limits.airframe, limits)
+    members = [FleetMember("first", line), FleetMember("next", apart)]
+    for seconds, enough in ((5.0, True), (0.1, False)):
+        tired = replace(limits, battery=replace(limits.battery, endurance=alone + seconds))
+        with nullcontext() if enough else pytest.raises(InfeasibleError, match=r"first: .*the battery is trusted"):
+            coordinate_fleet(FleetFile("row", (), 0.33, SKEW), members, tired, None)
 
 
 @pytest.fixture(scope="module")

@@ -100,7 +100,7 @@ def mission(y):
 def fleet():
     missions = {"left": mission(0.0), "right": mission(0.5)}
     flights = tuple(ConductedFlight(name, each.start[0], 0.0) for name, each in missions.items())
-    return FleetMissions(0.3, flights, missions, keeps_lost=True)
+    return FleetMissions(0.3, 0.03, flights, missions, keeps_lost=True)
 
 
 def first_seed(fleet, kind):

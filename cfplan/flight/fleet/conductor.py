@@ -49,7 +49,8 @@ STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: erro
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
-START_LATE = 0.02  # s after its time that a pilot may begin its plan; a deadline comes within 0.01 s
+FOR_ORDERS = 0.01  # s of the skew that is left for orders; pilots may begin their plans late by the rest
+"""Every streamed plan begins 0.01 to 0.02 s after its time, at a deadline, so two clocks differ by 0.01 s at most."""
 OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
@@ -138,9 +139,9 @@ def _between(seen: Sequence[PoseReceived | SetpointSent], time: float) -> Triple
 class Conductor:
     """Decides when each vehicle may arm, take off and begin, and when all brake."""
 
-    def __init__(self, flights: Sequence[ConductedFlight], apart: float, *, holds: bool = False):
+    def __init__(self, flights: Sequence[ConductedFlight], apart: float, skew: float, *, holds: bool = False):
         self._vehicles = {flight.name: _Vehicle(flight) for flight in flights}
-        self._apart = apart  # m between columns, as certified
+        self._apart, self._skew = apart, skew  # m between columns and s between clocks, as certified
         self.holds = holds  # all hover at their starts until a program sets it to false
         self.brakes = ""  # why all brake; the first reason stays
         self.begins = math.inf  # s, when the fleet's clock is at 0
@@ -186,14 +187,15 @@ class Conductor:
                 allowed = allowed_deviation(self._apart) + OFF_BY_MORE
                 if not (off := vehicle.deviation) <= allowed:
                     self._brake(f"{name}: it is {off:.2f} m beside its place, at most {allowed:.2f} m")
-            case SetpointSent(time=time, index=index):
+            case SetpointSent(due=due, index=index):
                 vehicle.setpoints.append(message)
-                late = time - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
-                if vehicle.phase is Phase.STREAM and late > START_LATE + OBEYS_LATE and not vehicle.left:
-                    self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE + OBEYS_LATE:g} s")
-            case PhaseEntered(time=began, phase=phase):
-                if phase is Phase.STREAM and (late := began - vehicle.cleared.get(phase, -math.inf)) > START_LATE:
-                    self._brake(f"{name}: it began {late:.2f} s late, at most {START_LATE:g} s")
+                late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
+                allowed = self._skew - FOR_ORDERS
+                if vehicle.phase is Phase.STREAM and late > allowed and not vehicle.left:
+                    self._brake(f"{name}: it began {late:.3f} s late, at most {allowed:.3f} s")
+            case PhaseEntered(phase=phase):
+                if phase is Phase.DISARM and Phase.ARM in vehicle.cleared and not vehicle.descending:
+                    self._brake(f"{name}: it ends before it has landed")  # its reason comes later, with its end
                 vehicle.phase = phase
                 vehicle.descending |= phase in _DESCENDING
                 vehicle.down |= phase in _DOWN
@@ -233,7 +235,7 @@ class Conductor:
         flying = [vehicle for vehicle in self._vehicles.values() if Phase.ARM in vehicle.asked and not vehicle.ended]
         for vehicle in flying:
             if not vehicle.down and now - vehicle.heard > PILOT_SILENT:
-                self._brake(f"{vehicle.name}: its pilot has been silent for {PILOT_SILENT:g} s")
+                self._brake(f"{vehicle.name}: neither setpoints nor poses came from its pilot for {PILOT_SILENT:g} s")
         for a, b in itertools.combinations(flying, 2):
             self._watch_pair(a, b, now)
 

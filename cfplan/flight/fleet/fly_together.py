@@ -6,6 +6,7 @@ or written. If the main process dies or this loop fails, all pilots notice at on
 """
 
 import contextlib
+import select
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -54,13 +55,16 @@ class FleetOutcome:
     @property
     def exit_code(self) -> ExitCode:
         """Return the worst of those that ended for their own reason; the others braked with them."""
-        own = [end.exit_code for end in self.ends.values() if not end.reason.startswith(_BRAKES_WITH)]
+        own = [end.exit_code for end in self.ends.values() if not _only_braked(end.reason)]
         if not own and not any(outcome.first_setpoint for outcome in self.outcomes.values()):
             return ExitCode.PREFLIGHT
-        return max(own, default=ExitCode.ENDED_BY_SAFETY)
+        worst = max(own, default=ExitCode.ENDED_BY_SAFETY)
+        return ExitCode.ENDED_BY_SAFETY if worst is ExitCode.OK and self.brakes else worst
 
 
-_BRAKES_WITH = "the fleet brakes"
+def _only_braked(reason: str) -> bool:
+    """Return whether a vehicle ended its flight because the fleet braked, and for no graver reason afterwards."""
+    return reason.startswith("the fleet brakes") and ", then " not in reason  # by which a pilot joins its reasons
 
 
 def fly_together(
@@ -103,7 +107,7 @@ class _Fleet:
         self._said: dict[str, tuple[ConductorMessage, float]] = {}  # what each was told last, and when, s
         self.outcomes: dict[str, FlightOutcome] = {}
         self.ends: dict[str, FlightEnded] = {}
-        self._orders: deque[Order] = deque()  # that no pilot has yet
+        self._orders = {name: deque[Order]() for name in self._pilots}  # that a pilot does not have yet
         self._news: SimpleQueue[tuple[str, Telemetry] | None] = SimpleQueue()  # for the listener; None ends it
         self.failure: BaseException | None = None  # the first one of the listener or a source of orders
 
@@ -129,14 +133,18 @@ class _Fleet:
     def take_orders(self, source: Callable[[], Iterable[Order]]) -> None:
         """Take the orders that a source returns."""
         try:
-            self._orders.extend(source())
+            self._order(*source())
         except BaseException as error:  # the other source still counts
             self._fail(error)
+
+    def _order(self, *orders: Order) -> None:
+        for waiting in self._orders.values():
+            waiting.extend(orders)
 
     def _fail(self, error: BaseException) -> None:
         if self.failure is None:
             self.failure = error
-            self._orders.append(Order.LAND)
+            self._order(Order.LAND)
 
     def release(self) -> None:
         """Let all pilots notice that they are alone; those that still fly land."""
@@ -145,10 +153,9 @@ class _Fleet:
 
     def pass_on(self) -> None:
         """Pass on orders, and what has come from pilots, at most after a moment."""
-        while self._orders:
-            order = self._orders.popleft()
-            for name in self._pilots:
-                self._send(name, order)
+        for name, waiting in self._orders.items():
+            while waiting and self._send(name, waiting[0]):
+                waiting.popleft()
         ready = set(wait([connection for _, connection in self._connections()], _PERIOD))
         for name, connection in self._connections():
             if connection in ready and name not in self.ends:
@@ -202,10 +209,15 @@ class _Fleet:
         """Tell each pilot what is new, or that the conductor is alive."""
         for name, message in self._conductor.say(now).items():
             before = self._said.get(name)
-            if before is None or before[0] != message or now - before[1] > _BEAT:
+            due = before is None or before[0] != message or now - before[1] > _BEAT
+            if due and self._send(name, message):
                 self._said[name] = message, now
-                self._send(name, message)
 
-    def _send(self, name: str, message: Order | ConductorMessage) -> None:
+    def _send(self, name: str, message: Order | ConductorMessage) -> bool:
+        """Send a message, and return True, unless the pilot reads so little that this would have to wait."""
+        orders = self._pilots[name].process.orders
         with contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
-            self._pilots[name].process.orders.send(message)
+            if not select.select([], [orders], [], 0.0)[1]:
+                return False
+            orders.send(message)
+        return True

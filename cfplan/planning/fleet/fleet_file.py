@@ -151,6 +151,7 @@ def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterat
                 hint="the name is relative to the fleet file",
             )
         uri = each.uri or (listed.uri(name, places.where_key(_KEY, name)) if listed is not None else "")
+        uri = re.sub(r"^radio://0+(?=\d)", "radio://", uri)  # radio://00 is the dongle of radio://0
         yield FleetVehicle(name, load_path_file(source).placed(*each.place.motion), uri, each.body)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.planning.fleet.clocks import CELL, TICK
-from cfplan.planning.fleet.lost import LossModel, groups_among, tubes_apart
+from cfplan.planning.fleet.lost import LossModel, groups_among
 from cfplan.planning.fleet.members import FleetMember
 
 STRIDE = 3 * TICK  # s of a plan's own time, from one row of a map to the next
@@ -41,7 +41,7 @@ class Hazards:
                 lost.distances(tubes[j], own_b, (members[i].plan, own_a), skew, far=far),
             )
             if any(groups_among(lost.together, (i, j))):
-                found = np.minimum(found, tubes_apart(tubes[i], own_a, tubes[j], own_b, skew))
+                found = np.minimum(found, lost.tubes_apart(tubes[i], own_a, tubes[j], own_b, skew))
             maps[i, j] = found.reshape(len(a), len(b))
             maps[j, i] = maps[i, j].T
         return cls(maps, lost.clearance)

@@ -127,7 +127,7 @@ class LossModel:
                 others = [j for j in range(count) if j not in group]
                 table[i, others] = away[i, others]
             for i, j in itertools.combinations(group, 2):
-                table[i, j] = tubes_apart(tubes[i], own[i], tubes[j], own[j], skew)
+                table[i, j] = self.tubes_apart(tubes[i], own[i], tubes[j], own[j], skew)
             worst.append(self._worst(group, table, times, members))
         return tuple(sorted(worst, key=lambda each: each.distance))
 
@@ -142,6 +142,18 @@ class LossModel:
         if callable(self.stop):
             return _off_path(tube, lost, self.stop(other[0]), other[1], skew, far)
         return _along_path(tube, lost, other, self.stop, skew, far)
+
+    def tubes_apart(self, tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:
+        """Return the least distance, (N,) m, between the tubes of two vehicles that lose their links together.
+
+        Both own times, (N,) s, are those of one moment; by their clocks they differ by `skew`, s, at most. If the link
+        of one of them comes back, it stays where it is then; tubes of flights on board contain that themselves.
+        """
+        late = int(np.ceil(skew * tube.rate))
+        rows = tube.rows(own), other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
+        ways = itertools.product(tube.boxes[1:], other.boxes[1:])  # the first is that of motors that stop at once
+        back = tube.boxes.shape[2] if callable(self.stop) else int(BACK / tube.part)
+        return np.min([_least_of_tubes(a, rows[0], b, rows[1], back) for a, b in ways], axis=0)
 
     def _worst(self, group: tuple[int, ...], away: NDArray, times: NDArray, members: Sequence[FleetMember]) -> Loss:
         """Return the moment at which others are least away; `away` has lost, other, time."""
@@ -308,30 +320,24 @@ def _least_off_path(
     return out
 
 
-def tubes_apart(tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:
-    """Return the least distance, (N,) m, between the tubes of two vehicles that lose their links together.
-
-    Both own times, (N,) s, are those of one moment; by their clocks they differ by `skew`, s, at most.
-    """
-    late = int(np.ceil(skew * tube.rate))
-    rows = tube.rows(own), other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
-    ways = itertools.product(tube.boxes[1:], other.boxes[1:])  # the first is that of motors that stop at once
-    return np.min([_least_of_tubes(a, rows[0], b, rows[1]) for a, b in ways], axis=0)
-
-
 @njit(nogil=True, error_model="numpy")
-def _least_of_tubes(boxes: NDArray, rows: NDArray, others: NDArray, rows_of_others: NDArray) -> NDArray:
+def _least_of_tubes(boxes: NDArray, rows: NDArray, others: NDArray, rows_of_others: NDArray, back: int) -> NDArray:
     """Return the least distances, (N,) m, of boxes, (R, S, 2, 3), to those of another vehicle.
 
-    Their last setpoints may be a period apart, so parts are compared with the next ones too.
+    Their last setpoints may be a period apart, so parts are compared with the next ones too. From part `back` on each
+    is compared with all from there on, as one vehicle may stay there.
     """
     out = np.full(len(rows), np.inf)
     parts, parts_of_others = boxes.shape[1], others.shape[1]
+    most = max(parts, parts_of_others)
     for n in range(len(rows)):
         for m in range(rows_of_others.shape[1]):
             tube, other = boxes[rows[n]], others[rows_of_others[n, m]]
-            for part in range(max(parts, parts_of_others)):
-                for k in range(max(part - 1, 0), part + 2):
+            for part in range(most):
+                first, last = max(part - 1, 0), part + 1
+                if part >= back:
+                    first, last = min(first, back), max(last, most - 1)
+                for k in range(first, last + 1):
                     away = _between_boxes(tube[min(part, parts - 1)], other[min(k, parts_of_others - 1)])
                     if away < out[n] or np.isnan(away):
                         out[n] = away

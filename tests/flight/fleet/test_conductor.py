@@ -1,13 +1,14 @@
 """The conductor as a pure core: what it hears of pilots, and what it tells them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
 from cfplan.errors import ExitCode
 from cfplan.flight.fleet.conductor import (
+    OBEYS_LATE,
     PILOT_SILENT,
-    START_LATE,
     START_LEAD,
     ConductedFlight,
     Conductor,
@@ -27,18 +28,19 @@ from cfplan.flight.telemetry import (
     VehicleStatus,
 )
 
-APART = 0.3
+APART, SKEW = 0.3, 0.03
 LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class Fleet:
     """Two vehicles 0.5 m from each other, as their conductor hears them."""
 
-    def __init__(self, delay=0.0, right=(0.5, 0.0, 0.0), apart=APART):
+    def __init__(self, delay=0.0, right=(0.5, 0.0, 0.0), apart=APART, skew=SKEW):
         self.places = {"left": (0.0, 0.0, 0.0), "right": right}
         starts = {name: (x, y, 0.6) for name, (x, y, _) in self.places.items()}
         delays = {"left": 0.0, "right": delay}
-        self.conductor = Conductor([ConductedFlight(name, starts[name], delays[name]) for name in starts], apart)
+        flights = [ConductedFlight(name, starts[name], delays[name]) for name in starts]
+        self.conductor = Conductor(flights, apart, skew)
         self.now = 1000.0
         self.silent = set()
 
@@ -149,19 +151,31 @@ def test_all_begin_at_one_time_each_after_its_delay():
     assert not braking(said)
 
 
-@pytest.mark.parametrize(("late", "brakes"), [(START_LATE - 0.001, False), (START_LATE + 0.001, True)])
-def test_all_brake_when_one_begins_late(late, brakes):
-    fleet = Fleet(delay=0.7)
-    begins = fleet.fly()["right"].cleared[Phase.STREAM]
-    fleet.go_on(1.3)
-    fleet.hear("right", PhaseEntered(begins + late, Phase.STREAM))
+@pytest.mark.parametrize("skew", [0.03, 0.05])
+@pytest.mark.parametrize(("more", "brakes"), [(-0.001, False), (0.001, True)])
+def test_all_brake_when_one_begins_so_late_that_no_skew_is_left_for_orders(skew, more, brakes):
+    fleet = Fleet(delay=0.7, skew=skew)
+    begins = fleet.fly()["right"].cleared[Phase.STREAM] + skew - 0.01 + more
+    fleet.go_on(1.9)
+    fleet.hear("right", PhaseEntered(begins - 0.01, Phase.STREAM))
+    fleet.hear("right", setpoint(begins, (0.5, 0.0, 0.6)))
     assert bool(braking(fleet.go_on(0.01))) is brakes
+
+
+def test_a_setpoint_that_is_sent_late_does_not_make_its_plan_late():
+    fleet = Fleet()
+    begins = fleet.fly()["right"].cleared[Phase.STREAM] + 0.015
+    fleet.go_on(1.2)
+    fleet.hear("right", PhaseEntered(begins - 0.01, Phase.STREAM))
+    on_time = setpoint(begins + 0.3, (0.5, 0.0, 0.6), 30)
+    fleet.hear("right", replace(on_time, time=begins + 0.34))
+    assert not braking(fleet.go_on(0.01))
 
 
 @pytest.mark.parametrize(("again", "brakes"), [(0.0, False), (0.3, True)])
 def test_all_brake_when_a_vehicle_on_board_must_be_told_again_to_begin(again, brakes):
     """Its plan begins anew with each command, so it is not off its path."""
-    fleet = Fleet()
+    fleet = Fleet(skew=SKEW + OBEYS_LATE)
     begins = fleet.fly()["right"].cleared[Phase.STREAM]
     fleet.go_on(1.2)
     fleet.hear("right", PhaseEntered(begins + 0.005, Phase.STREAM))
@@ -169,7 +183,7 @@ def test_all_brake_when_a_vehicle_on_board_must_be_told_again_to_begin(again, br
         fleet.hear("right", setpoint(begins + 0.03 + again + 0.01 * index, (0.5, 0.0, 0.6), index))
     said = fleet.go_on(0.01)
     assert bool(braking(said)) is brakes
-    assert ("right: it began 0.33 s late" in said["left"].brakes) is brakes
+    assert ("right: it began 0.330 s late" in said["left"].brakes) is brakes
 
 
 def test_a_pilot_that_hears_of_its_start_too_late_has_braked_before():
@@ -213,6 +227,26 @@ def test_all_brake_when_one_leaves_its_plan():
     assert fleet.conductor.stage is Stage.BRAKING
 
 
+def test_all_brake_as_soon_as_one_that_is_armed_ends_without_landing():
+    """It does not take off, and takes seconds to say why, since its link is closed and it restarts before."""
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    fleet.ask(Phase.ARM)
+    fleet.ask(Phase.TAKE_OFF)
+    fleet.rise("left")
+    fleet.hear("right", PhaseEntered(fleet.now, Phase.DISARM))
+    assert braking(fleet.go_on(0.01)) == {"left"}
+    assert "right: it ends before it has landed" in fleet.conductor.brakes
+
+
+def test_one_that_disarms_after_its_landing_is_no_reason_to_brake():
+    fleet = Fleet()
+    fleet.fly()
+    for phase in (Phase.STREAM, Phase.LAND, Phase.DISARM):
+        fleet.hear("right", PhaseEntered(fleet.now, phase))
+    assert not braking(fleet.go_on(0.01))
+
+
 def test_one_that_lands_at_its_end_goes_on_landing():
     fleet = Fleet()
     fleet.fly()
@@ -251,7 +285,7 @@ def test_all_brake_when_a_tick_loop_hangs_while_the_radio_of_that_pilot_goes_on(
         fleet.hear("right", Event(fleet.now, Level.WARNING, "radio: busy"))
         said = fleet.go_on(0.01)
     assert braking(said) == {"left", "right"}
-    assert "right: its pilot has been silent" in said["left"].brakes
+    assert "right: neither setpoints nor poses came from its pilot" in said["left"].brakes
 
 
 def test_all_brake_as_soon_as_a_pilot_reports_that_its_link_is_lost():

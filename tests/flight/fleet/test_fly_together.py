@@ -2,6 +2,7 @@
 
 import contextlib
 import multiprocessing
+import select
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -10,9 +11,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from cfplan.errors import LinkError
-from cfplan.flight.fleet.conductor import ConductedFlight, Conductor
-from cfplan.flight.fleet.fly_together import FleetPilot, fly_together
+from cfplan.errors import ExitCode, LinkError
+from cfplan.flight.fleet.conductor import ConductedFlight, Conductor, FlightEnded
+from cfplan.flight.fleet.fly_together import FleetOutcome, FleetPilot, fly_together
 from cfplan.flight.pilot.conducted import ConductorMessage, PlanLeft
 from cfplan.flight.pilot.keys import Keyboard, Order
 from cfplan.flight.pilot.outcome import Rung
@@ -78,7 +79,7 @@ def fly(pilots, conductor=None, keyboard=None, **options):
     flights = [ConductedFlight(name, (float(number), 0.0, 0.6), 0.0) for number, name in enumerate(NAMES)]
     return fly_together(
         [FleetPilot(flight, None, "", None, pilots[flight.name].process) for flight in flights],
-        conductor or Conductor(flights, 0.3),
+        conductor or Conductor(flights, 0.3, 0.03),
         keyboard=keyboard or Keyboard(keys=False),
         **{"listen": lambda name, message: None} | options,
     )
@@ -115,6 +116,30 @@ def test_a_keyboard_or_a_listener_that_fails_lands_all(pilots, source):
             pilot.hears(lambda message: message is Order.LAND)
     with pytest.raises(ZeroDivisionError):
         flown.result()
+
+
+def test_a_pilot_that_reads_nothing_keeps_no_order_from_the_others(pilots):
+    stuck = pilots["left"].process.orders
+    while select.select([], [stuck], [], 0.0)[1]:
+        stuck.send("not read")
+    orders = iter([[Order.CUT]])
+    with flying(pilots, more_orders=lambda: next(orders, ())):
+        pilots["right"].hears(lambda message: message is Order.CUT)
+        pilots["left"].hears(lambda message: message is Order.CUT)  # once it reads
+
+
+@pytest.mark.parametrize(
+    ("code", "reason", "expected"),
+    [
+        (ExitCode.OK, "landed", ExitCode.ENDED_BY_SAFETY),
+        (ExitCode.ENDED_BY_SAFETY, "the fleet brakes: b: it is 0.30 m beside its place", ExitCode.ENDED_BY_SAFETY),
+        (ExitCode.LINK_LOST, "the fleet brakes: b: it is late, then the link was lost", ExitCode.LINK_LOST),
+        (ExitCode.ENDED_BY_OPERATOR, "the operator landed it", ExitCode.ENDED_BY_OPERATOR),
+    ],
+)
+def test_a_fleet_that_had_to_brake_did_not_end_well_although_one_vehicle_had_landed(code, reason, expected):
+    ends = {"a": FlightEnded(ExitCode.OK, "landed"), "b": FlightEnded(code, reason)}
+    assert FleetOutcome({}, ends, "b: it is late", begins=0.0, nearest=1.0).exit_code is expected
 
 
 def test_if_the_conductor_fails_all_pilots_notice_before_one_is_waited_for(pilots):

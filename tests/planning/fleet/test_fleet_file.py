@@ -95,6 +95,8 @@ def test_vehicles_of_one_dongle_are_known_by_their_addresses(fleet_file):
         + "  c: {path: line.yaml, place: {y: 3}, uri: 'radio://1/80/2M/E7E7E7E703'}\n"
     )
     assert load_fleet_file(fleet_file(three)).dongles == {"0": (0, 1)}
+    same = three.replace("radio://0/80/2M/E7E7E7E702", "radio://00/80/2M/E7E7E7E702")
+    assert load_fleet_file(fleet_file(same)).dongles == {"0": (0, 1)}
     assert load_fleet_file(fleet_file(TWO)).dongles == {}
 
 

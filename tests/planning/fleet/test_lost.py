@@ -10,7 +10,7 @@ from cfplan.flight.setpoints.encoding import RATE, encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.flight.setpoints.stops import stop_clock, stop_motion
 from cfplan.planning.fleet.coordination import Blocked, coordinate
-from cfplan.planning.fleet.lost import NOTICED, LossModel, Tube, tubes_apart
+from cfplan.planning.fleet.lost import BACK, NOTICED, LossModel, Tube
 from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.dry_run import fly_drawn, rehearsed_flight
 from cfplan.simulation.link_loss import TUBE_PART, link_loss_tubes
@@ -175,12 +175,28 @@ def test_a_tube_is_compared_with_each_place_that_the_other_may_be_at(crossing):
     assert np.isnan(distances(Tube(box[None], RATE, 0.04), np.zeros(4), (other, own))).all()
 
 
+def together(a, b):
+    own, model = np.array([0.0, 0.02]), LossModel(lambda plan: a, STOP, (), CLEARANCE)
+    return model.tubes_apart(a, own, b, own, SKEW)
+
+
 def test_boxes_of_two_tubes_are_compared_part_by_part():
     still = np.zeros((1, 3, 2, 2, 3))
     moved = still + np.array([1.0, 0.0, 0.0])
     moved[0, :, 1, :, 0] = 0.3
     far = np.full_like(still, 50.0)  # of motors that stop at once, which these two do not do together
     a, b = (Tube(np.concatenate([far, lost]), RATE, 0.04) for lost in (still, moved))
-    own = np.array([0.0, 0.02])
-    assert tubes_apart(a, own, b, own, SKEW) == pytest.approx([0.3, 0.3])
-    assert tubes_apart(b, own, a, own, SKEW) == pytest.approx([0.3, 0.3])
+    assert together(a, b) == pytest.approx([0.3, 0.3])
+    assert together(b, a) == pytest.approx([0.3, 0.3])
+
+
+@pytest.mark.parametrize(("first", "distance"), [(2, 100.0), (12, 0.0)])
+def test_one_of_two_whose_link_comes_back_stays_where_the_other_may_come_by_later(first, distance):
+    """Both pass the same point, one in a part before or behind BACK, the other later."""
+    a, b, later = np.zeros((2, 1, 30, 2, 3)), np.zeros((2, 1, 30, 2, 3)), 20
+    assert (0.04 * first < BACK) is (distance > 0.0)
+    a[..., 0], b[..., 1] = 100.0, 100.0
+    a[:, :, first] = b[:, :, later] = 0.0
+    tubes = [Tube(boxes, RATE, 0.04) for boxes in (a, b)]
+    assert together(*tubes) == pytest.approx([distance, distance])
+    assert together(*tubes[::-1]) == pytest.approx([distance, distance])
