@@ -8,6 +8,7 @@ import gc
 import math
 import multiprocessing
 import os
+import select
 import signal
 import sys
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ from cfplan.air.replanning import next_part, replan
 from cfplan.air.requests import PathAnswer, PathRequest, Wish
 from cfplan.air.stopping import halt
 from cfplan.air.timeline import Timeline
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, RequestRefusedError
 from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.pilot.proposals import read_answer
 from cfplan.flight.setpoints.encoding import RATE
@@ -51,10 +52,17 @@ class AirPlanner:
         self.ready = False  # whether it has reported that it can plan
 
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
-        """Send a request; return its number, which its answer names. A planner that has ended never answers."""
-        self._number += 1
+        """Send a request; return its number, which its answer names. A planner that has ended never answers.
+
+        Raises RequestRefusedError if a planner that hangs has not read those before.
+        """
         points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
+        self._number += 1
         with contextlib.suppress(OSError):
+            if not select.select([], [self._requests], [], 0.0)[1]:
+                raise RequestRefusedError(
+                    "the planner does not read requests any more", where="planner", hint="land; the flight goes on"
+                )
             self._requests.send(PathRequest(self._number, wish, points))
         return self._number
 

@@ -64,7 +64,10 @@ def fly_and_record(
             record = read_record(folder)
             summary = {"uri": vehicle.uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
             summary["deviation_grows_with_speed"] = suggests_identification(record)
-            write_summary(folder, summary)
+            try:
+                write_summary(folder, summary)
+            except OSError as error:  # the vehicle has landed all the same
+                steps.failed("summary", str(error))
     return RecordedFlight(outcome, record, summary)
 
 

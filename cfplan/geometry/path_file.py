@@ -237,7 +237,7 @@ def load_path_file(file: pathlib.Path | str) -> PathFile:
         source=file,
         losses=tuple(losses),
         shape=content.shape if through else None,
-        regions=_regions(content, len(waypoints)) if through else (),
+        regions=_regions(content, len(waypoints), places) if through else (),
         corridor=content.corridor,
     ).placed(*content.place.motion)
 
@@ -286,13 +286,20 @@ def _check_choice(content: _Content, places: Places, given: str, through: bool) 
             )
 
 
-def _regions(content: _Content, count: int) -> tuple[Region, ...]:
-    """Return the region of each waypoint of all laps, `count`, before the path is placed."""
+def _regions(content: _Content, count: int, places: Places) -> tuple[Region, ...]:
+    """Return the region of each waypoint of all laps, `count`, before the path is placed. Raises InputError."""
     if content.waypoints is None:
         return (None,) * count
     of_file = [waypoint.region for waypoint in content.waypoints]
-    lap = [*of_file[1:-1], of_file[0]]
-    return (*of_file[:1], *lap * content.laps) if content.laps > 1 else tuple(of_file)
+    if content.laps == 1:
+        return tuple(of_file)
+    if of_file[-1] != of_file[0]:
+        raise InputError(
+            "the last waypoint is the first one of the next lap, and differs from it in its gate or `within`",
+            where=places.where("waypoints", len(of_file) - 1),
+            hint="write both alike, or fly one lap",
+        )
+    return (*of_file[:1], *of_file[1:] * content.laps)
 
 
 def path_through(points: ArrayLike, name: str = "points") -> PathFile:

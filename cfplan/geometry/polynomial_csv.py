@@ -70,7 +70,8 @@ def _sampled(durations: NDArray, table: NDArray) -> NDArray:
 
     times = np.append((starts + np.linspace(0.0, durations, _TIMES, endpoint=False)).T.ravel(), durations.sum())
     along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at(times), axis=0), axis=1)))
-    return at(np.interp(np.linspace(0.0, along[-1], max(4, 1 + math.ceil(along[-1] / _SPACING))), along, times))
+    count = 1 + math.ceil(min(_MOST_SAMPLES, along[-1] / _SPACING))  # one more than most is refused
+    return at(np.interp(np.linspace(0.0, along[-1], max(4, count)), along, times))
 
 
 def polynomial_rows(durations: NDArray, coefficients: NDArray) -> str:

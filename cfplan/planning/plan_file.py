@@ -16,6 +16,7 @@ from pydantic import TypeAdapter, ValidationError
 from cfplan.errors import CfplanError, InputError
 from cfplan.files.atomic import atomic_output
 from cfplan.geometry.path import Path
+from cfplan.geometry.polynomials import derivatives_on
 from cfplan.planning.plan_result import LocalSlowing, Plan
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits
@@ -30,6 +31,7 @@ RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
 _HINT = "make it again with `cfplan plan`"
+_JOINTS_WITHIN = 1e-6  # of the size of each derivative
 
 
 def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:
@@ -108,6 +110,8 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
     limits = TypeAdapter(Limits).validate_python(metadata["limits"])
     path = Path(np.array(metadata["path"]["breaks"]), np.array(metadata["path"]["coefficients"]))
     profile = SpeedProfile(**{f.name: np.array(metadata["profile"][f.name], dtype=float) for f in fields(SpeedProfile)})
+    if not (jumps := _jump(path)) <= _JOINTS_WITHIN:
+        raise ValueError(f"its path jumps by {jumps:.3g} between two pieces")
     trajectory = Trajectory(path, profile, airframe)
     joints = tuple(map(float, metadata.get("joints", ())))  # older files have none
     if not all(0.0 < joint < path.end for joint in joints):
@@ -128,6 +132,13 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
         joints=joints,
         slowing=slowing,
     )
+
+
+def _jump(path: Path) -> float:
+    """Return how far the path or one of its first three derivatives jumps between two pieces, relative to its size."""
+    at, left = path.breaks[1:-1], np.arange(len(path.breaks) - 2)
+    before, behind = (derivatives_on(path.origins, path.coefficients, at, piece)[:4] for piece in (left, left + 1))
+    return float(np.max(np.abs(before - behind) / (1.0 + np.abs(before)), initial=0.0))
 
 
 def _rebuilt_slowing(slowing: dict[str, Any] | None, path: Path) -> LocalSlowing | None:

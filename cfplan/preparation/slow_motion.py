@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.pilot.mission import SHORTEST_MANOEUVRE, Mission, manoeuvre_time
+from cfplan.flight.pilot.mission import Mission, manoeuvre_time
 from cfplan.flight.setpoints.commitment import QUANTUM
 from cfplan.flight.setpoints.descent import descent, gentle
 from cfplan.flight.setpoints.encoding import encode_motion
@@ -25,6 +25,7 @@ from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.telemetry import Triple
 from cfplan.numbers import coordinates
 from cfplan.preparation.steps import OnStep, ignore_steps, step
+from cfplan.safety.limits import SHORTEST_MANOEUVRE
 from cfplan.safety.space import Space, inside
 from cfplan.simulation.link_loss import link_loss_of_slow_motion
 

@@ -114,13 +114,16 @@ class LinkLossLimits:
 class FirmwareSettings:
     """Settings that the pilot writes to the vehicle and reads back."""
 
-    controller: Annotated[int, Ge(1), Le(6)]  # stabilizer.controller
-    estimator: Annotated[int, Ge(1), Le(3)]  # stabilizer.estimator
+    controller: Annotated[int, Ge(2), Le(2)]  # stabilizer.controller: Mellinger, which every certificate assumes
+    estimator: Annotated[int, Ge(2), Le(2)]  # stabilizer.estimator: Kalman, likewise
     oldest: tuple[int, ...]  # oldest permitted firmware
     newest: tuple[int, ...] = ()  # newest permitted firmware; older plan files have none
     watchdog: bool = True
     """Whether the watchdog is used: motors stop 1 s after the last keep-alive packet, and the vehicle locks, also after
     landing, where the pilot restarts it."""
+
+
+SHORTEST_MANOEUVRE = 1.5  # s, however short the way is
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from cfplan.files.yaml_with_places import Places, read_plain, read_yaml_with_pla
 from cfplan.safety.feasibility import describe_hover, hover_violation
 from cfplan.safety.limits import (
     LARGEST_IN_PACKET,
+    SHORTEST_MANOEUVRE,
     Encodable,
     FirmwareSettings,
     FlightLimits,
@@ -42,6 +43,10 @@ _PLANNING_MINIMA = {
     "angular_acceleration": 0.05,
 }
 """Lower bounds of planning limits: slower motion would be hidden by noise of gyroscope and poses."""
+
+_PEAK_OVER_MEAN = {"take_off_speed": 15 / 8, "go_to_speed": 15 / 8, "land_speed": 1.5}
+"""Of the speeds under ground: from hover to hover, and of a landing, in flight/setpoints/."""
+_PEAK_ACCELERATION = 10 / math.sqrt(3)  # of a way of 1 m in 1 s from hover to hover
 
 _LOOKED_AT = 65  # grid points along each side of the room, for places to take off to
 
@@ -261,6 +266,18 @@ def _check_limits(content: Any, places: Places) -> None:
                 f"plan.{quantity.key} ({planned:g}) is not below flight.{quantity.ladder}.brake ({abort:g})",
                 where=places.where("plan", quantity.key),
                 hint=f"a flight as planned would be broken off: plan slower, or allow more in flight.{quantity.ladder}",
+            )
+    for key, peak in _PEAK_OVER_MEAN.items():
+        most = content.plan.speed / peak
+        if key != "land_speed":  # over the shortest way that takes no less than SHORTEST_MANOEUVRE
+            leans = GRAVITY * math.tan(math.radians(content.plan.tilt_deg))
+            most = min(most, min(content.plan.acceleration, leans) * SHORTEST_MANOEUVRE / _PEAK_ACCELERATION)
+        if getattr(content.ground, key) > most:
+            raise InputError(
+                f"ground.{key} is {getattr(content.ground, key):g} m/s in the mean; its motion would exceed the limits "
+                "under plan",
+                where=places.where("ground", key),
+                hint=f"write at most {math.floor(1000 * most) / 1000:g}",
             )
 
 

@@ -126,7 +126,7 @@ QUANTITIES = (
     Quantity(
         "motor thrust, least", "N", "motor_thrust_min", "motor_reserve", AT_LEAST, measures.MOTOR_THRUST, 4, jumps=True,
         remedy="choose a stronger vehicle or a smaller reserve",
-        hover=lambda airframe: airframe.hover_thrust,
+        hover=lambda airframe: airframe.hover_thrust, in_stop=lambda limits: limits.airframe.thrust_range[0],
     ),
     Quantity(
         "specific thrust, least", "m/s²", "specific_thrust_min", "specific_thrust", AT_LEAST, measures.SPECIFIC_THRUST,

@@ -185,8 +185,9 @@ def link_loss_tubes(payloads: NDArray, limits: Limits, rows: NDArray, rate: floa
     """Lose the link after the setpoints `rows`, (F,) int, of a flight, (N, 29) uint8 at `rate`, Hz.
 
     Returns boxes, (2, F, S, 2, 3) m: low and high corners of the space that the vehicle is in during each TUBE_PART
-    from the setpoint on, first if its motors stop at once, then if it flies on with that setpoint. They enclose the
-    vehicles with all motor lags and errors of the estimate. In the last part the vehicle lies on the floor.
+    from the setpoint on, with heights above the floor, first if its motors stop at once, then if it flies on with that
+    setpoint. They enclose the vehicles with all motor lags and errors of the estimate. In the last part the vehicle
+    lies on the floor.
     """
     state, airframes, error = decode(payloads), _airframes(limits), limits.link_loss.vertical_acceleration_error
     setpoints = setpoint_rows(state)
@@ -194,6 +195,7 @@ def link_loss_tubes(payloads: NDArray, limits: Limits, rows: NDArray, rate: floa
     forks = _Forks(setpoints, rows, snapshots, airframes, parts=_LONGEST // TUBE_PART, part=TUBE_PART)
     alone = _united([_go_on(forks, limits, error), _go_on(forks, limits, -error)])
     tubes = np.stack([_fall(forks, limits), alone])
+    tubes[..., 2] -= limits.space.low[2]
     flies = np.flatnonzero((tubes[..., 1, 2] > 0.0).any(axis=(0, 1)))
     return tubes[:, :, : flies.max(initial=0) + 2]
 
@@ -341,22 +343,23 @@ def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) 
     parts = forks.parts or (_PARTS if limits.space.obstacles else 1)
     boxes = simulate(batch, schedule, parts=parts).boxes
     if forks.parts:
-        _keep_drift(boxes, schedule)
+        _keep_drift(boxes, schedule, limits.space.low[2])
     return _united(list(boxes.reshape(lags, count, parts, 2, 3)))
 
 
-def _keep_drift(boxes: NDArray, schedule: Schedule) -> None:
+def _keep_drift(boxes: NDArray, schedule: Schedule, floor: float) -> None:
     """Widen the boxes of a tube, (F, S, 2, 3) m, in which a vehicle lies by the drift until it came down.
 
-    Those behind the end of the simulation repeat the box in which it came down; their height becomes that of the floor.
+    Those behind the end of the simulation repeat the box in which it came down; their height becomes that of the
+    `floor`, m.
     """
-    lies = boxes[:, :, 1, 2] <= 0.0
+    lies = boxes[:, :, 1, 2] <= floor
     steps = lies.argmax(axis=1) * schedule.part // schedule.step
     aside = np.where(lies, schedule.spread[np.minimum(steps, len(schedule.spread) - 1)][:, None], 0.0)[..., None]
     boxes[:, :, 0, :2] -= aside
     boxes[:, :, 1, :2] += aside
-    ended = (boxes[:, 1:] == boxes[:, :-1]).all(axis=(2, 3)) & (boxes[:, 1:, 0, 2] <= 0.0)
-    boxes[:, 1:, 1, 2][ended] = 0.0
+    ended = (boxes[:, 1:] == boxes[:, :-1]).all(axis=(2, 3)) & (boxes[:, 1:, 0, 2] <= floor)
+    boxes[:, 1:, 1, 2][ended] = floor
 
 
 def _drift(limits: Limits, off: int, step: int) -> NDArray:
@@ -386,13 +389,13 @@ def _united(boxes: list[NDArray]) -> NDArray:
 
 def _airframes(limits: Limits) -> NDArray:
     """Return (L, 26): the airframe with each motor lag."""
-    return _packed(limits.airframe, tuple(_lags(limits)))
+    return _packed(limits.airframe, tuple(_lags(limits)), limits.space.low[2])
 
 
 @lru_cache(maxsize=8)
-def _packed(airframe: Airframe, lags: tuple[float, ...]) -> NDArray:
+def _packed(airframe: Airframe, lags: tuple[float, ...], floor: float) -> NDArray:
     each: list[Airframe] = [replace(airframe, motor_time_constant=lag) for lag in lags]
-    return np.stack([pack_airframe(one) for one in each])
+    return np.stack([pack_airframe(one, floor=floor) for one in each])
 
 
 def _lags(limits: Limits) -> list[float]:

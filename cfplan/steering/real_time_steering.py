@@ -54,6 +54,7 @@ class RealTimeSteering:
         self._change = threading.Condition()
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
+        self._alone = False  # the program's main thread has ended, and the vehicle was told to land
         self._unanswered: set[int] = set()
         self._fault: BaseException | None = None  # in the thread that listens to the planner
         self.planner: AirPlanner | None = None
@@ -138,6 +139,9 @@ class RealTimeSteering:
                 REAL_CLOCK.sleep(_LISTEN_PERIOD)
 
     def _next_orders(self) -> Iterator[Order]:
+        if not self._alone and not threading.main_thread().is_alive():  # the program has ended, or failed
+            self._alone = True
+            yield Order.LAND
         while self._orders:
             yield self._orders.popleft()
         yield from self._more_orders()

@@ -43,6 +43,7 @@ class SteeringRecord:
         )
         self._clock, self._uri = clock, uri
         self._writer = RecordWriter(self.folder, self.header, warn=lambda _: None, clock=clock)
+        self._summary_failure = ""
         self.listeners: list[Callable[[Telemetry], None]] = []
 
     def tell(self, message: Telemetry) -> None:
@@ -76,7 +77,7 @@ class SteeringRecord:
     @property
     def failure(self) -> str:
         """Return why something could not be written, one line; empty if nothing failed."""
-        return self._writer.failure
+        return self._writer.failure or self._summary_failure
 
     def close(self, outcome: FlightOutcome | None) -> tuple[Record, dict[str, Any]] | None:
         """End the record; return it and its summary if there was a flight."""
@@ -86,7 +87,10 @@ class SteeringRecord:
         record = read_record(self.folder)
         summary = {"uri": self._uri, "outcome": outcome.to_dict(), **summarise(record).to_json()}
         summary["deviation_grows_with_speed"] = suggests_identification(record)
-        write_summary(self.folder, summary)
+        try:
+            write_summary(self.folder, summary)
+        except OSError as error:  # the flight has ended well all the same
+            self._summary_failure = f"the summary: {error}"
         return record, summary
 
 

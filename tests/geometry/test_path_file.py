@@ -169,6 +169,9 @@ def test_polynomials_whose_snap_jumps_are_drawn_smoothly_and_those_whose_jerk_ju
         assert np.linalg.norm(near, axis=1).min() < 1e-4
     with pytest.raises(InputError, match=r"jerk jumps by 0\.5 "):
         load("polynomials: two.csv\n", two=pieces(3))
+    endless = pieces(4).replace("\n1.0,", "\n1e5,")
+    with pytest.raises(InputError, match="more than 50000 samples"):
+        load("polynomials: two.csv\n", two=endless)
 
 
 def test_many_waypoints_recall_the_curve(load):
@@ -227,6 +230,14 @@ def test_hundreds_of_samples_keep_their_shape(load):
         ),
         ("shape: min-snap\nwaypoints:\n- [0,0,1]\n- {at: [1,0,1], within: 0.1}\n", ":4:3: gates and `within` are"),
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 2\n", ":2:7: 2 laps need a closed path, but the last point is 1.000 m"),
+        (
+            "waypoints: [{at: [0,0,1], within: 0.5}, [1,1,1], [0,2,1], [0,0,1]]\nlaps: 2\n",
+            "last waypoint is the first",
+        ),
+        (
+            "waypoints: [[0,0,1], [1,1,1], [0,2,1], {at: [0,0,1], within: 0.1}]\nlaps: 2\n",
+            "differs from it",
+        ),
         ("waypoints: [[0,0,1],[1,0,1]]\nlaps: 0\n", ":2:7: laps should be greater than or equal to 1, not 0"),
         ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 0\n", ":2:8: speed should be greater than 0, not 0"),
         ("waypoints: [[0,0,1],[1,0,1]]\nspeed: 1.01\n", ":2:8: speed: a share of the speed that the limits allow"),

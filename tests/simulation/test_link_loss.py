@@ -81,6 +81,19 @@ def test_a_vehicle_that_hovers_comes_down_below_where_it_was(limits):
     assert "inside the walls" in str(lost)
 
 
+def test_where_it_comes_down_is_the_same_in_a_room_whose_floor_is_lower(line, limits):
+    (low, high), down = (limits.space.low, limits.space.high), np.array([0.0, 0.0, 1.0])
+    lower = replace(limits, space=replace(limits.space, low=tuple(low - down), high=tuple(high - down)))
+    state = decode(line.payloads)
+    payloads = encode(replace(state, position=state.position - down))
+    ours, theirs = simulate_link_loss(line.payloads, limits), simulate_link_loss(payloads, lower)
+    assert (theirs.moment, theirs.beyond) == pytest.approx((ours.moment, ours.beyond), abs=1e-3)
+    assert theirs.distance == pytest.approx(ours.distance, abs=1e-3) != 0.0
+    rows = np.arange(0, len(payloads), 40)
+    tubes = link_loss_tubes(line.payloads, limits, rows), link_loss_tubes(payloads, lower, rows)
+    np.testing.assert_allclose(*tubes, atol=1e-3)
+
+
 def test_the_faster_it_flies_the_farther_it_goes(limits):
     distances = [simulate_link_loss(straight(speed), limits).distance for speed in (0.5, 1.0, 1.5)]
     assert distances == sorted(distances)

@@ -1,6 +1,7 @@
 """Threads of the main process in a steered flight: none of them fails silently."""
 
 import pickle
+import threading
 from contextlib import nullcontext
 from unittest.mock import Mock
 
@@ -9,6 +10,7 @@ from waiting import until
 
 from cfplan.air.requests import PathAnswer, PathVerdict
 from cfplan.errors import CfplanError
+from cfplan.flight.pilot.keys import Order
 from cfplan.preparation.steps import ignore_steps
 from cfplan.steering import real_time_steering
 from cfplan.steering.flight_in_progress import Listeners
@@ -23,6 +25,26 @@ def cannot_be_heard(_):
     raise ZeroDivisionError
 
 
+def fly_until_an_order(*_, more_orders, **__):
+    given = []
+    assert until(lambda: given.extend(more_orders()) or given)
+    return given
+
+
+def test_a_program_whose_main_thread_has_ended_lands_its_vehicle(monkeypatch):
+    monkeypatch.setattr(real_time_steering, "StartingVehicle", lambda *_: nullcontext(Mock()))
+    monkeypatch.setattr(
+        real_time_steering, "AirPlanner", lambda *_: nullcontext(Mock(ready=True, answers=lambda _: []))
+    )
+    monkeypatch.setattr(real_time_steering, "fly", fly_until_an_order)
+    flight = RealTimeSteering("sim://0", None, Mock(), ignore_steps, keys=False)
+    monkeypatch.setattr(threading, "main_thread", lambda: Mock(is_alive=lambda: False))
+    flight.start(Mock(), Mock(), Listeners(lambda _: None, lambda _: None))
+    assert until(lambda: flight.outcome is not None)
+    flight.close()
+    assert flight.outcome == [Order.LAND]
+
+
 @pytest.mark.parametrize(
     ("answers", "listen", "fault"),
     [
@@ -32,11 +54,6 @@ def cannot_be_heard(_):
 )
 def test_a_fault_in_hearing_the_planner_lands_the_vehicle_and_is_said(monkeypatch, answers, listen, fault):
     planner = Mock(ready=True, alive=True, answers=lambda _: answers())
-
-    def fly_until_an_order(*_, more_orders, **__):
-        given = []
-        assert until(lambda: given.extend(more_orders()) or given)
-        return given
 
     monkeypatch.setattr(real_time_steering, "StartingVehicle", lambda *_: nullcontext(Mock()))
     monkeypatch.setattr(real_time_steering, "AirPlanner", lambda *_: nullcontext(planner))

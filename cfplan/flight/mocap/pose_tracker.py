@@ -82,10 +82,9 @@ class PoseTracker:
         self._sensed.note(estimate, status)
         self._airborne = airborne
         self._estimate = estimate if airborne and fresh else None
+        self._check.attitude = None if self._estimate is None else self._estimate.quaternion
         if self._estimate is None:
             self._log_since = now
-        else:
-            self._check.attitude = self._estimate.quaternion
 
     def take(self, pose: Pose) -> bool:
         """Judge a pose, and use it if it is good: `fault` is empty then.

@@ -79,9 +79,9 @@ class Keyboard:
     """Collects orders while it is entered; without a terminal, from signals only.
 
     Keys are read from the terminal that started the program where standard input is a pipe or a file.
-    Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM and SIGHUP land.
-    Ctrl-Z and Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of output. If the
-    terminal closes, the vehicle lands too, and further output is dropped.
+    Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM, SIGHUP and Ctrl-\\ land.
+    Ctrl-Z and, where keys are read, Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of
+    output. If the terminal closes, the vehicle lands too, and further output is dropped.
     """
 
     def __init__(self, *, keys: bool = True) -> None:
@@ -96,8 +96,9 @@ class Keyboard:
 
     def __enter__(self) -> "Keyboard":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT):
                 self._handlers[number] = signal.signal(number, self._on_signal)
+            self._handlers[signal.SIGTSTP] = signal.signal(signal.SIGTSTP, signal.SIG_IGN)
         # No terminal, or not in its foreground: signals only.
         with contextlib.suppress(termios.error, OSError, ValueError, AttributeError):
             descriptor = sys.stdin.fileno()

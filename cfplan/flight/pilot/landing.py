@@ -21,7 +21,7 @@ from cfplan.flight.pilot.health import FRESH, Descent
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.radio.supervisor_bits import FLYING
-from cfplan.flight.setpoints.descent import QUICK, Pace, descent, gentle, off_walls, sinking
+from cfplan.flight.setpoints.descent import MIN_HEIGHT_ASIDE, QUICK, Pace, descent, gentle, off_walls, sinking
 from cfplan.flight.telemetry import Level, Phase, Triple
 
 _DEPTH_BELOW_FLOOR = 0.3  # m below the take-off position and below the space, where setpoints end
@@ -69,7 +69,9 @@ class Landing:
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, self._aside)
+            on_floor = loop.setpoint_now()[0][2] - self._floor < MIN_HEIGHT_ASIDE  # as at the beginning of a take-off
+            aside = (lambda place: (0.0, 0.0)) if on_floor else self._aside
+            sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, aside)
             loop.begin(Stream(sinks, stream.rate))
 
     def land(self) -> None:

@@ -2,11 +2,13 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Protocol
 
 from cfplan.errors import PreflightError
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import AbortRaised, FlightLoop
+from cfplan.flight.pilot.health import FRESH, Health
 from cfplan.flight.pilot.hover_check import check_hover
 from cfplan.flight.pilot.mission import manoeuvre_time
 from cfplan.flight.pilot.outcome import Rung
@@ -46,12 +48,23 @@ class Manoeuvres(Protocol):
 
 
 def _require_ready(loop: FlightLoop) -> None:
-    """Wait until the vehicle's supervisor reports that it can fly; it ignores setpoints until then.
+    """Wait until all sources are fresh and the supervisor reports that the vehicle can fly; else it ignores setpoints.
 
-    Raises PreflightError if it does not.
+    Raises PreflightError if the vehicle cannot fly, or poses or one of its logs have gone since preflight.
     """
-    if loop.until(lambda: loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, READY_TIMEOUT):
+
+    def can_fly() -> bool:
+        return loop.status is not None and loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY
+
+    if loop.until(lambda: can_fly() and loop.health == Health(), READY_TIMEOUT):
         return
+    if can_fly():
+        silent = [f"{name} {fresh}" for name, fresh in asdict(loop.health).items() if fresh is not FRESH]
+        raise PreflightError(
+            f"the vehicle may not take off: {', '.join(silent)}",
+            where="vehicle",
+            hint="look at motion capture and the radio, and start again",
+        )
     if loop.status is None:
         raise PreflightError("the vehicle does not report its status", where="vehicle", hint="restart it and try again")
     faults = " and ".join(fault for bit, fault in FAULTS.items() if loop.bits(bit))

@@ -10,10 +10,8 @@ from cfplan.flight.setpoints.encoding import LEAD, RATE, EncodedFlight
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Triple
-from cfplan.safety.limits import Limits
+from cfplan.safety.limits import SHORTEST_MANOEUVRE, Limits
 from cfplan.vehicle.rotations import yaw_of
-
-SHORTEST_MANOEUVRE = 1.5  # s
 
 
 @dataclass(frozen=True, slots=True)

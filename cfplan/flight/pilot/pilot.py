@@ -26,6 +26,9 @@ from cfplan.flight.radio.link import Link
 from cfplan.flight.radio.supervisor_bits import ARMED, LOCKED
 from cfplan.flight.telemetry import Level, Phase, Telemetry
 
+_STATUS_AFTER = 0.06  # s from an order until a status shows it: 0.04 s of the supervisor and 0.02 s of its log
+_DISARM_TIMEOUT = 0.3  # s
+
 CUT_TIMEOUT = 2.5  # s for a cut to arrive; without setpoints the vehicle stops its motors after 2 s by itself
 
 
@@ -166,9 +169,15 @@ class Pilot:
         """Disarm the vehicle; return whether it confirms. If the radio is dead, wait: it may come back."""
         loop, heard = self._loop, 0
         give_up = loop.now() + LINK_LOST_AFTER
+
+        def shown() -> bool:
+            status = loop.status  # one from before the order may not show an arming that has just been ordered
+            return status is not None and status.time > asked + _STATUS_AFTER and not loop.bits(ARMED)
+
         while heard < ATTEMPTS and loop.now() < give_up:
+            asked = loop.now()
             loop.link.arm(False)
-            if loop.until(lambda: loop.health.status is FRESH and not loop.bits(ARMED), 0.2):
+            if loop.until(lambda: loop.health.status is FRESH and shown(), _DISARM_TIMEOUT):
                 return True
             heard += loop.health.uplink is FRESH
         return False

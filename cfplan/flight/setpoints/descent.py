@@ -34,7 +34,7 @@ _ASIDE_MAX = 0.4  # m, along x or y, in one stop or descent
 _ASIDE_ACCELERATION = 1.5  # m/s², of a descent sideways: a tilt of 9°
 _STOP_ASIDE_ACCELERATION = 3.0  # m/s², of a stop's setpoints, which the vehicle does not follow as fast
 _BY_SMOOTHSTEP = 10.0 / math.sqrt(3.0)  # peak acceleration of a quintic smoothstep over 1 m in 1 s
-_MIN_HEIGHT_ASIDE = 0.1  # m above the floor, below which a descent only sinks
+MIN_HEIGHT_ASIDE = 0.1  # m above the floor, below which a vehicle does not move sideways without poses
 
 _Sideways = tuple[NDArray, NDArray, NDArray]
 
@@ -91,7 +91,7 @@ def descent(
     position[:, 2] = [*heights, heights[-1]]
     velocity[:-1, 2] = -np.array(speeds)
     change[:-2, 2] = -np.diff(speeds) * rate
-    above = sum(height - floor > _MIN_HEIGHT_ASIDE for height in heights)
+    above = sum(height - floor > MIN_HEIGHT_ASIDE for height in heights)
     sideways = _sideways(aside, above, count, rate, _ASIDE_ACCELERATION)
     position[:, :2] += sideways[0]
     velocity[:, :2], change[:, :2] = sideways[1:]

@@ -61,6 +61,20 @@ def sent(step, times=TIMES, *, senses=True):
 # Judging.
 
 
+def test_a_vehicle_that_turned_while_its_log_and_its_poses_were_silent_is_known_again():
+    tracker, half = PoseTracker(LIMITS), 0.5  # rad/s, of half the angle
+    seen = [time for time in TIMES if not 2.2 < time < 2.45]
+    for time in seen:
+        if time < 1.5:
+            sense(tracker, time)
+        else:
+            tracker.sense(time, None, None, airborne=True, fresh=False)
+        turned = (0.0, 0.0, math.sin(half * max(time - 1.5, 0.0)), math.cos(half * max(time - 1.5, 0.0)))
+        taken = tracker.take(Pose(time, time, straight(time), turned))
+    assert taken
+    assert not tracker.fault
+
+
 def test_the_newest_good_pose_is_sent_once_and_a_bad_one_never():
     tracker = tracked(straight)
     assert tracker.to_send(0.2) is not None

@@ -77,7 +77,16 @@ def test_the_first_interrupt_lands_and_the_second_cuts():
         assert keyboard.orders() == [Order.CUT]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("keys", [True, False])
+def test_a_stop_of_the_program_from_the_terminal_is_ignored(keys):
+    before = signal.getsignal(signal.SIGTSTP)
+    with Keyboard(keys=keys) as keyboard:
+        os.kill(os.getpid(), signal.SIGTSTP)
+        assert keyboard.orders() == []
+    assert signal.getsignal(signal.SIGTSTP) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_wish_to_end_the_program_lands(number):
     with Keyboard() as keyboard:
         os.kill(os.getpid(), number)

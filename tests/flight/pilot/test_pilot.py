@@ -401,6 +401,23 @@ def test_a_pose_from_before_a_stream_is_not_judged_by_it(world, fly):
     assert "from the setpoint" not in outcome.reason
 
 
+@pytest.mark.parametrize(
+    ("silent", "moment", "said"),
+    [
+        ("poses_stopped", 0.0, "may not take off: poses gone"),
+        ("estimate_silent", 0.1, "may not take off: estimate gone"),
+        ("status_silent", 0.1, "does not report its status"),
+    ],
+)
+def test_a_vehicle_that_is_armed_does_not_take_off_once_a_source_is_gone(world, fly, silent, moment, said):
+    world.when(Phase.ARM, moment, lambda: setattr(world, silent, True))
+    outcome = fly()
+    assert outcome.exit_code is ExitCode.PREFLIGHT
+    assert said in outcome.reason
+    assert not world.sent()
+    assert not world.armed
+
+
 def test_a_source_without_poses_is_an_error_with_a_hint(world, fly):
     world.poses_stopped = True
     with pytest.raises(InputError, match="no pose comes") as caught:
