@@ -49,8 +49,8 @@ STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: erro
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
-FOR_ORDERS = 0.01  # s of the skew that is left for orders; pilots may begin their plans late by the rest
-"""Every streamed plan begins 0.01 to 0.02 s after its time, at a deadline, so two clocks differ by 0.01 s at most."""
+FOR_ORDERS = 0.01  # s of the skew that is left for orders: clocks of two vehicles may differ by the rest
+"""A streamed plan begins at one of the next three deadlines after its time, 0.01 s apart, and most at the same one."""
 OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
@@ -97,6 +97,7 @@ class _Vehicle:
     heard: float = -math.inf  # s, when its pilot's tick loop was heard last
     poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
     setpoints: deque[SetpointSent] = field(default_factory=lambda: deque(maxlen=_POSES))  # of its plan
+    late: float | None = None  # s, by which its plan began after its time; None before that
     phase: Phase | None = None  # the last that it has entered
     stood: Triple | None = None  # m, when it passed preflight
     descending: bool = False
@@ -189,10 +190,9 @@ class Conductor:
                     self._brake(f"{name}: it is {off:.2f} m beside its place, at most {allowed:.2f} m")
             case SetpointSent(due=due, index=index):
                 vehicle.setpoints.append(message)
-                late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
-                allowed = self._skew - FOR_ORDERS
-                if vehicle.phase is Phase.STREAM and late > allowed and not vehicle.left:
-                    self._brake(f"{name}: it began {late:.3f} s late, at most {allowed:.3f} s")
+                if vehicle.phase is Phase.STREAM and not vehicle.left:
+                    vehicle.late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
+                    self._compare_clocks(vehicle, vehicle.late)
             case PhaseEntered(phase=phase):
                 if phase is Phase.DISARM and Phase.ARM in vehicle.cleared and not vehicle.descending:
                     self._brake(f"{name}: it ends before it has landed")  # its reason comes later, with its end
@@ -225,6 +225,15 @@ class Conductor:
     def _reason_for(self, vehicle: _Vehicle) -> str:
         """Return why a vehicle must brake; one that has flown its plan lands anyway."""
         return "" if vehicle.descending and not vehicle.left else self.brakes
+
+    def _compare_clocks(self, vehicle: _Vehicle, late: float) -> None:
+        """Let all brake if a plan began too late, by itself or compared with that of another vehicle."""
+        others = [other.late for other in self._vehicles.values() if other.late is not None]
+        apart, allowed = max(others) - min(others), self._skew - FOR_ORDERS
+        if late > self._skew:
+            self._brake(f"{vehicle.name}: it began {late:.3f} s late, at most {self._skew:.3f} s")
+        elif apart > allowed:
+            self._brake(f"{vehicle.name}: its clock is {apart:.3f} s from that of another, at most {allowed:.3f} s")
 
     def _brake(self, reason: str) -> None:
         self.brakes = self.brakes or reason

@@ -151,14 +151,31 @@ def test_all_begin_at_one_time_each_after_its_delay():
     assert not braking(said)
 
 
+def begin(fleet, name, late, index=0):
+    """Let a vehicle begin its plan so late, s, and be heard at a setpoint."""
+    begins = fleet.conductor.begins + (0.7 if name == "right" else 0.0) + late
+    fleet.hear(name, PhaseEntered(begins - 0.01, Phase.STREAM))
+    fleet.hear(name, setpoint(begins + 0.01 * index, (*fleet.places[name][:2], 0.6), index))
+
+
 @pytest.mark.parametrize("skew", [0.03, 0.05])
 @pytest.mark.parametrize(("more", "brakes"), [(-0.001, False), (0.001, True)])
-def test_all_brake_when_one_begins_so_late_that_no_skew_is_left_for_orders(skew, more, brakes):
+def test_all_brake_when_one_begins_later_than_the_skew(skew, more, brakes):
     fleet = Fleet(delay=0.7, skew=skew)
-    begins = fleet.fly()["right"].cleared[Phase.STREAM] + skew - 0.01 + more
-    fleet.go_on(1.9)
-    fleet.hear("right", PhaseEntered(begins - 0.01, Phase.STREAM))
-    fleet.hear("right", setpoint(begins, (0.5, 0.0, 0.6)))
+    fleet.fly()
+    fleet.go_on(1.3)
+    begin(fleet, "left", skew + more)
+    assert bool(braking(fleet.go_on(0.01))) is brakes
+
+
+@pytest.mark.parametrize("skew", [0.03, 0.05])
+@pytest.mark.parametrize(("more", "brakes"), [(-0.001, False), (0.001, True)])
+def test_all_brake_when_two_clocks_differ_so_much_that_no_skew_is_left_for_orders(skew, more, brakes):
+    fleet = Fleet(delay=0.7, skew=skew)
+    fleet.fly()
+    fleet.go_on(2.0)
+    begin(fleet, "left", 0.005, index=70)
+    begin(fleet, "right", 0.005 + skew - 0.01 + more)
     assert bool(braking(fleet.go_on(0.01))) is brakes
 
 

@@ -63,7 +63,7 @@ OWN = standing(MISSIONS)
 
 def fleet_of(missions=MISSIONS, delays=None):
     flights = [ConductedFlight(name, each.start[0], (delays or {}).get(name, 0.0)) for name, each in missions.items()]
-    return SteppedFleet(missions, Conductor(flights, APART), settings=standing(missions))
+    return SteppedFleet(missions, Conductor(flights, APART, 0.03), settings=standing(missions))
 
 
 def streaming(fleet, name, moment, act):
@@ -238,7 +238,7 @@ def two():
 def test_two_vehicles_whose_poses_all_stop_come_no_nearer_than_certified(two, moment):
     planned, missions = two
     flights = [ConductedFlight(each.name, missions[each.name].start[0], each.delay) for each in planned.members]
-    fleet = SteppedFleet(missions, Conductor(flights, planned.apart), settings=standing(missions))
+    fleet = SteppedFleet(missions, Conductor(flights, planned.apart, planned.skew), settings=standing(missions))
     first = min(planned.members, key=lambda each: each.delay).name
     flight = fleet.fly(streaming(fleet, first, moment, lambda: lose_all_poses(fleet)))
     assert_all_down(flight)
@@ -285,7 +285,7 @@ def test_a_link_lost_before_take_off_ends_with_all_disarmed():
             lab.clock.at(lab.now + 0.2, lambda: lab.disturb(RadioFault(RadioFaultKind.DEAD)))
 
     flight = fleet.fly(react)
-    assert flight.exit_codes["left"] is ExitCode.LINK_LOST
+    assert flight.exit_codes["left"] in (ExitCode.LINK_LOST, ExitCode.PREFLIGHT)  # as it may not take off
     assert "left" in flight.brakes
     assert State.READY_TO_FLY in flight.truths["left"].supervisor
     assert all(truth.position[:, 2].max() < 0.02 for truth in flight.truths.values())

@@ -49,7 +49,7 @@ def fleet(prepared):
         name: VehicleSettings(position=(*each.start[0][:2], 0.0), yaw=each.start[1], auto_arming=False)
         for name, each in missions.items()
     }
-    return SteppedFleet(missions, Conductor(flights, planned.apart), settings=standing)
+    return SteppedFleet(missions, Conductor(flights, planned.apart, planned.skew), settings=standing)
 
 
 def fly(fleet, name, moment, act):
