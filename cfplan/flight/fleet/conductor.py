@@ -97,7 +97,7 @@ class _Vehicle:
     heard: float = -math.inf  # s, when its pilot's tick loop was heard last
     poses: deque[PoseReceived] = field(default_factory=lambda: deque(maxlen=_POSES))
     setpoints: deque[SetpointSent] = field(default_factory=lambda: deque(maxlen=_POSES))  # of its plan
-    late: float | None = None  # s, by which its plan began after its time; None before that
+    late: float = -math.inf  # s from the time at which its plan was to begin until it began; -inf before that
     phase: Phase | None = None  # the last that it has entered
     stood: Triple | None = None  # m, when it passed preflight
     descending: bool = False
@@ -191,8 +191,9 @@ class Conductor:
             case SetpointSent(due=due, index=index):
                 vehicle.setpoints.append(message)
                 if vehicle.phase is Phase.STREAM and not vehicle.left:
-                    vehicle.late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
-                    self._compare_clocks(vehicle, vehicle.late)
+                    late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
+                    vehicle.late = max(vehicle.late, late)  # less where a stalled pilot skips setpoints
+                    self._compare_clocks(vehicle)
             case PhaseEntered(phase=phase):
                 if phase is Phase.DISARM and Phase.ARM in vehicle.cleared and not vehicle.descending:
                     self._brake(f"{name}: it ends before it has landed")  # its reason comes later, with its end
@@ -226,12 +227,12 @@ class Conductor:
         """Return why a vehicle must brake; one that has flown its plan lands anyway."""
         return "" if vehicle.descending and not vehicle.left else self.brakes
 
-    def _compare_clocks(self, vehicle: _Vehicle, late: float) -> None:
+    def _compare_clocks(self, vehicle: _Vehicle) -> None:
         """Let all brake if a plan began too late, by itself or compared with that of another vehicle."""
-        others = [other.late for other in self._vehicles.values() if other.late is not None]
-        apart, allowed = max(others) - min(others), self._skew - FOR_ORDERS
-        if late > self._skew:
-            self._brake(f"{vehicle.name}: it began {late:.3f} s late, at most {self._skew:.3f} s")
+        begun = [each.late for each in self._vehicles.values() if each.late > -math.inf]
+        apart, allowed = max(begun) - min(begun), self._skew - FOR_ORDERS
+        if vehicle.late > self._skew:
+            self._brake(f"{vehicle.name}: it began {vehicle.late:.3f} s late, at most {self._skew:.3f} s")
         elif apart > allowed:
             self._brake(f"{vehicle.name}: its clock is {apart:.3f} s from that of another, at most {allowed:.3f} s")
 

@@ -179,6 +179,19 @@ def test_all_brake_when_two_clocks_differ_so_much_that_no_skew_is_left_for_order
     assert bool(braking(fleet.go_on(0.01))) is brakes
 
 
+def test_a_pilot_that_stalls_and_skips_setpoints_has_the_clock_of_before():
+    fleet = Fleet()
+    fleet.fly()
+    fleet.go_on(1.3)
+    begins = fleet.conductor.begins + 0.02
+    for name in fleet.places:
+        fleet.hear(name, PhaseEntered(begins - 0.01, Phase.STREAM))
+        fleet.hear(name, setpoint(begins, (*fleet.places[name][:2], 0.6)))
+    skipped = setpoint(begins + 0.1, (0.5, 0.0, 0.6), 15)  # due 0.05 s before it was sent
+    fleet.hear("right", replace(skipped, time=begins + 0.15))
+    assert not braking(fleet.go_on(0.01))
+
+
 def test_a_setpoint_that_is_sent_late_does_not_make_its_plan_late():
     fleet = Fleet()
     begins = fleet.fly()["right"].cleared[Phase.STREAM] + 0.015
