@@ -126,12 +126,8 @@ def test_a_plain_link_after_another_hears_that_its_vehicle_acknowledged_a_packet
     assert pilot.answer_to(1)
     pilot.link.close()
     again = Pilot(dongles, "left", "?safelink=0&autoping=0&ackfilter=0")
-
-    def acknowledged():
-        again.link.send_packet(CRTPPacket(0xFF, bytearray(b"\xfe\x02")))  # again, as without safelink one may be lost
-        return getattr(again.link.receive_packet(0.1), "header", 0) == 0xFF
-
-    assert until(acknowledged)
+    again.link.send_packet(CRTPPacket(0xFF, bytearray(b"\xfe\x02")))
+    assert until(lambda: getattr(again.link.receive_packet(0.1), "header", 0) == 0xFF)
 
 
 def test_the_reader_of_a_closed_link_takes_no_packet_of_the_next_link(dongles):
