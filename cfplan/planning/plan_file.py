@@ -31,7 +31,7 @@ RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
 _HINT = "make it again with `cfplan plan`"
-_JOINTS_WITHIN = 1e-6  # of the size of each derivative
+_JUMP_TOLERANCE = 1e-6  # relative to the size of each derivative
 
 
 def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:
@@ -110,8 +110,8 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
     limits = TypeAdapter(Limits).validate_python(metadata["limits"])
     path = Path(np.array(metadata["path"]["breaks"]), np.array(metadata["path"]["coefficients"]))
     profile = SpeedProfile(**{f.name: np.array(metadata["profile"][f.name], dtype=float) for f in fields(SpeedProfile)})
-    if not (jumps := _jump(path)) <= _JOINTS_WITHIN:
-        raise ValueError(f"its path jumps by {jumps:.3g} between two pieces")
+    if not (jump := _jump(path)) <= _JUMP_TOLERANCE:
+        raise ValueError(f"its path jumps by {jump:.3g} between two pieces")
     trajectory = Trajectory(path, profile, airframe)
     joints = tuple(map(float, metadata.get("joints", ())))  # older files have none
     if not all(0.0 < joint < path.end for joint in joints):

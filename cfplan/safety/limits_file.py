@@ -45,8 +45,8 @@ _PLANNING_MINIMA = {
 """Lower bounds of planning limits: slower motion would be hidden by noise of gyroscope and poses."""
 
 _PEAK_OVER_MEAN = {"take_off_speed": 15 / 8, "go_to_speed": 15 / 8, "land_speed": 1.5}
-"""Of the speeds under ground: from hover to hover, and of a landing, in flight/setpoints/."""
-_PEAK_ACCELERATION = 10 / math.sqrt(3)  # of a way of 1 m in 1 s from hover to hover
+"""Of each speed under `ground`: the largest speed over the mean one, of a motion between hovers and of a landing."""
+_PEAK_ACCELERATION = 10 / math.sqrt(3)  # m/s², of a motion between two hovers over 1 m in 1 s
 
 _LOOKED_AT = 65  # grid points along each side of the room, for places to take off to
 
@@ -269,13 +269,13 @@ def _check_limits(content: Any, places: Places) -> None:
             )
     for key, peak in _PEAK_OVER_MEAN.items():
         most = content.plan.speed / peak
-        if key != "land_speed":  # over the shortest way that takes no less than SHORTEST_MANOEUVRE
-            leans = GRAVITY * math.tan(math.radians(content.plan.tilt_deg))
-            most = min(most, min(content.plan.acceleration, leans) * SHORTEST_MANOEUVRE / _PEAK_ACCELERATION)
+        if key != "land_speed":  # the largest acceleration is that of a motion that takes just SHORTEST_MANOEUVRE
+            at_tilt = GRAVITY * math.tan(math.radians(content.plan.tilt_deg))
+            most = min(most, min(content.plan.acceleration, at_tilt) * SHORTEST_MANOEUVRE / _PEAK_ACCELERATION)
         if getattr(content.ground, key) > most:
             raise InputError(
-                f"ground.{key} is {getattr(content.ground, key):g} m/s in the mean; its motion would exceed the limits "
-                "under plan",
+                f"ground.{key} is a mean speed, and a motion at a mean of {getattr(content.ground, key):g} m/s exceeds the "
+                "limits under plan",
                 where=places.where("ground", key),
                 hint=f"write at most {math.floor(1000 * most) / 1000:g}",
             )

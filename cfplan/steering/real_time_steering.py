@@ -54,7 +54,7 @@ class RealTimeSteering:
         self._change = threading.Condition()
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
-        self._alone = False  # the program's main thread has ended, and the vehicle was told to land
+        self._abandoned = False  # whether the program's main thread has ended, so that the vehicle was told to land
         self._unanswered: set[int] = set()
         self._fault: BaseException | None = None  # in the thread that listens to the planner
         self.planner: AirPlanner | None = None
@@ -139,8 +139,8 @@ class RealTimeSteering:
                 REAL_CLOCK.sleep(_LISTEN_PERIOD)
 
     def _next_orders(self) -> Iterator[Order]:
-        if not self._alone and not threading.main_thread().is_alive():  # the program has ended, or failed
-            self._alone = True
+        if not self._abandoned and not threading.main_thread().is_alive():
+            self._abandoned = True
             yield Order.LAND
         while self._orders:
             yield self._orders.popleft()

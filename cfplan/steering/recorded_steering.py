@@ -89,7 +89,7 @@ class SteeringRecord:
         summary["deviation_grows_with_speed"] = suggests_identification(record)
         try:
             write_summary(self.folder, summary)
-        except OSError as error:  # the flight has ended well all the same
+        except OSError as error:  # as on a full disk; the outcome is reported all the same
             self._summary_failure = f"the summary: {error}"
         return record, summary
 

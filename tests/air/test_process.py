@@ -15,6 +15,7 @@ from cfplan.air.process import AirPlanner
 from cfplan.air.replanning import replan
 from cfplan.air.requests import PathAnswer, PathVerdict, Wish
 from cfplan.air.timeline import hold
+from cfplan.errors import RequestRefusedError
 from cfplan.flight.clock import REAL_CLOCK
 from cfplan.flight.pilot.proposals import ReceivedProposals
 from cfplan.flight.setpoints.commitment import (
@@ -248,6 +249,15 @@ def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(bot
         pilot.tick()
     assert pilot.commitment is held.commitment
     assert planner.answers() == []
+
+
+def test_a_request_to_a_planner_that_hangs_is_refused_instead_of_waiting(both):
+    planner, _ = both
+    process = stopped(planner)
+    with pytest.raises(RequestRefusedError, match=r"no longer reads"):
+        for _ in range(1000):  # far more than the pipe holds
+            planner.request(Wish.REPLACE, 100 * FAR)
+    process.resume()
 
 
 def test_what_is_no_proposal_is_none(held):

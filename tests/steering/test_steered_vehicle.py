@@ -67,6 +67,17 @@ def test_the_readmes_example_flies_and_is_recorded(connect, limits):
     assert vehicle.summary["peak_speed"] > 1.0
 
 
+def test_a_summary_that_cannot_be_written_hides_no_outcome(connect):
+    with connect() as vehicle:
+        vehicle.take_off(0.8)
+        (vehicle.record / "summary.json").mkdir()
+        vehicle.fly([[0.5, 0, 1]])
+        vehicle.wait()
+        vehicle.land()
+    assert vehicle.outcome.exit_code is ExitCode.OK
+    assert vehicle.summary["max_deviation"] < 0.1
+
+
 def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limits):
     vehicle, flight = flown
     vehicle.fly([[1, 0, 1], [0, 1, 1.2]])

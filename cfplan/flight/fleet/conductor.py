@@ -49,8 +49,8 @@ STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: erro
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
-FOR_ORDERS = 0.01  # s of the skew that is left for orders: clocks of two vehicles may differ by the rest
-"""A streamed plan begins at one of the next three deadlines after its time, 0.01 s apart, and most at the same one."""
+FOR_ORDERS = 0.01  # s that an order to brake may arrive later at one pilot than at another
+"""The certificate contains both differences in one skew, so clocks of vehicles may differ by the skew less this."""
 OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
@@ -196,7 +196,7 @@ class Conductor:
                     self._compare_clocks(vehicle)
             case PhaseEntered(phase=phase):
                 if phase is Phase.DISARM and Phase.ARM in vehicle.cleared and not vehicle.descending:
-                    self._brake(f"{name}: it ends before it has landed")  # its reason comes later, with its end
+                    self._brake(f"{name}: its flight ended before it landed")  # its reason comes later, with its end
                 vehicle.phase = phase
                 vehicle.descending |= phase in _DESCENDING
                 vehicle.down |= phase in _DOWN
@@ -232,9 +232,11 @@ class Conductor:
         begun = [each.late for each in self._vehicles.values() if each.late > -math.inf]
         apart, allowed = max(begun) - min(begun), self._skew - FOR_ORDERS
         if vehicle.late > self._skew:
-            self._brake(f"{vehicle.name}: it began {vehicle.late:.3f} s late, at most {self._skew:.3f} s")
+            self._brake(f"{vehicle.name}: it began {vehicle.late:.3f} s late (limit {self._skew:.3f} s)")
         elif apart > allowed:
-            self._brake(f"{vehicle.name}: its clock is {apart:.3f} s from that of another, at most {allowed:.3f} s")
+            self._brake(
+                f"{vehicle.name}: its clock differs by {apart:.3f} s from that of another vehicle (limit {allowed:.3f} s)"
+            )
 
     def _brake(self, reason: str) -> None:
         self.brakes = self.brakes or reason

@@ -54,7 +54,7 @@ class FleetOutcome:
 
     @property
     def exit_code(self) -> ExitCode:
-        """Return the worst of those that ended for their own reason; the others braked with them."""
+        """Return the worst exit code of the vehicles that ended for reasons of their own; the others braked with them."""
         own = [end.exit_code for end in self.ends.values() if not _only_braked(end.reason)]
         if not own and not any(outcome.first_setpoint for outcome in self.outcomes.values()):
             return ExitCode.PREFLIGHT
@@ -214,7 +214,7 @@ class _Fleet:
                 self._said[name] = message, now
 
     def _send(self, name: str, message: Order | ConductorMessage) -> bool:
-        """Send a message, and return True, unless the pilot reads so little that this would have to wait."""
+        """Send a message, and return True; return False where the pilot's pipe is full, as sending would block."""
         orders = self._pilots[name].process.orders
         with contextlib.suppress(OSError):  # a pilot that is gone is noticed by its telemetry
             if not select.select([], [orders], [], 0.0)[1]:

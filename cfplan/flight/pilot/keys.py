@@ -80,8 +80,8 @@ class Keyboard:
 
     Keys are read from the terminal that started the program where standard input is a pipe or a file.
     Space lands, Esc cuts; Ctrl-C lands the first time and cuts the second; SIGTERM, SIGHUP and Ctrl-\\ land.
-    Ctrl-Z and, where keys are read, Ctrl-S are off: they would stop the program in the air, Ctrl-S at its next line of
-    output. If the terminal closes, the vehicle lands too, and further output is dropped.
+    Ctrl-Z is ignored, and so is Ctrl-S where keys are read: they would stop the program in the air, Ctrl-S at its next
+    line of output. If the terminal closes, the vehicle lands too, and further output is dropped.
     """
 
     def __init__(self, *, keys: bool = True) -> None:

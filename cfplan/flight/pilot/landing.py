@@ -69,8 +69,8 @@ class Landing:
         loop, stream = self._loop, self._loop.stream
         if stream is not None:
             left = stream.payloads[stream.index(loop.now()) - stream.first :]
-            on_floor = loop.setpoint_now()[0][2] - self._floor < MIN_HEIGHT_ASIDE  # as at the beginning of a take-off
-            aside = (lambda place: (0.0, 0.0)) if on_floor else self._aside
+            low = loop.setpoint_now()[0][2] - self._floor < MIN_HEIGHT_ASIDE  # as at the beginning of a take-off
+            aside = _not_aside if low else self._aside
             sinks = sinking(left, self._floor + _MIN_SINKING_HEIGHT, QUICK.speed, stream.rate, aside)
             loop.begin(Stream(sinks, stream.rate))
 
@@ -205,6 +205,11 @@ class Landing:
             return False
         setpoint_position = loop.setpoint_position(estimate.time)
         return setpoint_position is not None and estimate.position[2] - setpoint_position[2] > _NO_THRUST_GAP
+
+
+def _not_aside(place: Triple) -> tuple[float, float]:
+    """Return no displacement, m: straight down."""
+    return 0.0, 0.0
 
 
 def stands_by_poses(loop: FlightLoop, floor: float, not_held: float = math.inf) -> bool:

@@ -146,8 +146,8 @@ class LossModel:
     def tubes_apart(self, tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:
         """Return the least distance, (N,) m, between the tubes of two vehicles that lose their links together.
 
-        Both own times, (N,) s, are those of one moment; by their clocks they differ by `skew`, s, at most. If the link
-        of one of them comes back, it stays where it is then; tubes of flights on board contain that themselves.
+        `own` and `own_of_other`, (N,) s, are the times of both clocks at one moment, uncertain by `skew`, s. A vehicle
+        whose link comes back stays where it is then; tubes of flights on board contain that themselves.
         """
         late = int(np.ceil(skew * tube.rate))
         rows = tube.rows(own), other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)
@@ -324,8 +324,9 @@ def _least_off_path(
 def _least_of_tubes(boxes: NDArray, rows: NDArray, others: NDArray, rows_of_others: NDArray, back: int) -> NDArray:
     """Return the least distances, (N,) m, of boxes, (R, S, 2, 3), to those of another vehicle.
 
-    Their last setpoints may be a period apart, so parts are compared with the next ones too. From part `back` on each
-    is compared with all from there on, as one vehicle may stay there.
+    Row n compares tube `rows[n]` with each tube of `rows_of_others[n]`, part by part in time. Their last setpoints may
+    be a period apart, so each part is compared with the one before and the next one too. From part `back` on, each is
+    compared with all later ones, as one of the vehicles may stay where it is.
     """
     out = np.full(len(rows), np.inf)
     parts, parts_of_others = boxes.shape[1], others.shape[1]

@@ -266,7 +266,7 @@ def test_all_brake_as_soon_as_one_that_is_armed_ends_without_landing():
     fleet.rise("left")
     fleet.hear("right", PhaseEntered(fleet.now, Phase.DISARM))
     assert braking(fleet.go_on(0.01)) == {"left"}
-    assert "right: it ends before it has landed" in fleet.conductor.brakes
+    assert "right: its flight ended before it landed" in fleet.conductor.brakes
 
 
 def test_one_that_disarms_after_its_landing_is_no_reason_to_brake():

@@ -227,6 +227,21 @@ def test_an_order_to_arm_or_disarm_that_the_radio_swallows_is_sent_again(world, 
     assert not world.armed
 
 
+def test_a_status_from_before_the_order_confirms_no_disarming(world, fly):
+    """As if the vehicle had been armed so lately that its newest status does not show it yet."""
+
+    def show_unarmed() -> None:
+        world.status = replace(world.status, time=world.now, supervisor=0)
+        world.status_silent = True
+        world.clock.at(world.now + 0.03, lambda: setattr(world, "status_silent", False))
+
+    world.when(Phase.LAND, 0.0, lambda: setattr(world, "arms_lost", 1))
+    world.when(Phase.DISARM, 0.0, show_unarmed)
+    assert fly().exit_code is ExitCode.OK
+    assert world.calls.count("disarm") == 2
+    assert not world.armed
+
+
 def test_a_cut_is_sent_until_the_vehicle_says_that_it_is_locked(world, fly):
     world.cuts_lost = 20
     world.when(Phase.STREAM, 1.0, lambda: cut(world))
