@@ -61,7 +61,7 @@ class AirPlanner:
         with contextlib.suppress(OSError):
             if not select.select([], [self._requests], [], 0.0)[1]:
                 raise RequestRefusedError(
-                    "the planner no longer reads requests", where="planner", hint="land: the vehicle still flies its path"
+                    "the planner no longer reads requests", where="planner", hint="land: the vehicle flies on"
                 )
             self._requests.send(PathRequest(self._number, wish, points))
         return self._number

@@ -274,8 +274,8 @@ def _check_limits(content: Any, places: Places) -> None:
             most = min(most, min(content.plan.acceleration, at_tilt) * SHORTEST_MANOEUVRE / _PEAK_ACCELERATION)
         if getattr(content.ground, key) > most:
             raise InputError(
-                f"ground.{key} is a mean speed, and a motion at a mean of {getattr(content.ground, key):g} m/s exceeds the "
-                "limits under plan",
+                f"ground.{key} is a mean speed, and a motion at a mean of {getattr(content.ground, key):g} m/s exceeds "
+                "the limits under plan",
                 where=places.where("ground", key),
                 hint=f"write at most {math.floor(1000 * most) / 1000:g}",
             )

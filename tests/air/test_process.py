@@ -254,9 +254,13 @@ def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(bot
 def test_a_request_to_a_planner_that_hangs_is_refused_instead_of_waiting(both):
     planner, _ = both
     process = stopped(planner)
-    with pytest.raises(RequestRefusedError, match=r"no longer reads"):
+
+    def fill() -> None:
         for _ in range(1000):  # far more than the pipe holds
             planner.request(Wish.REPLACE, 100 * FAR)
+
+    with pytest.raises(RequestRefusedError, match=r"no longer reads"):
+        fill()
     process.resume()
 
 

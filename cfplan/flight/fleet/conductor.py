@@ -235,7 +235,7 @@ class Conductor:
             self._brake(f"{vehicle.name}: it began {vehicle.late:.3f} s late (limit {self._skew:.3f} s)")
         elif apart > allowed:
             self._brake(
-                f"{vehicle.name}: its clock differs by {apart:.3f} s from that of another vehicle (limit {allowed:.3f} s)"
+                f"{vehicle.name}: its clock and that of another differ by {apart:.3f} s (limit {allowed:.3f} s)"
             )
 
     def _brake(self, reason: str) -> None:

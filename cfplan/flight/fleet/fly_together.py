@@ -54,7 +54,7 @@ class FleetOutcome:
 
     @property
     def exit_code(self) -> ExitCode:
-        """Return the worst exit code of the vehicles that ended for reasons of their own; the others braked with them."""
+        """Return the worst exit code of vehicles that ended for their own reasons; the others braked with them."""
         own = [end.exit_code for end in self.ends.values() if not _only_braked(end.reason)]
         if not own and not any(outcome.first_setpoint for outcome in self.outcomes.values()):
             return ExitCode.PREFLIGHT
