@@ -34,6 +34,7 @@ PRIORITY = -10  # niceness of the planner, if allowed: below the pilot, above al
 _GARBAGE = 100_000  # allocations after which garbage is collected in any case
 _SWITCH_INTERVAL = 0.0002  # s, after which a thread that waits for the interpreter gets it
 _CLOSE_WITHIN = 1.0  # s
+_READ_WITHIN = 2.0  # s; during a job, which is much shorter, requests fill the pipe
 _FIRST_JOBS = 1.0, 0.1  # s to assume for a plan and for a stop if warming up made none
 _MIDDLE = 0.4, 0.6  # fractions of the space's size: the places that plans of the warm-up lead to
 
@@ -54,12 +55,13 @@ class AirPlanner:
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
         """Send a request; return its number, which its answer names. A planner that has ended never answers.
 
-        Raises RequestRefusedError if a planner that hangs has not read those before.
+        Where the pipe is full of earlier requests, wait for the planner to read them; raises RequestRefusedError if it
+        hangs.
         """
         points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
         self._number += 1
         with contextlib.suppress(OSError):
-            if not select.select([], [self._requests], [], 0.0)[1]:
+            if not select.select([], [self._requests], [], _READ_WITHIN)[1]:
                 raise RequestRefusedError(
                     "the planner no longer reads requests", where="planner", hint="land: the vehicle flies on"
                 )

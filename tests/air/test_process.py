@@ -2,6 +2,7 @@
 
 import multiprocessing
 import signal
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -262,6 +263,16 @@ def test_a_request_to_a_planner_that_hangs_is_refused_instead_of_waiting(both):
     with pytest.raises(RequestRefusedError, match=r"no longer reads"):
         fill()
     process.resume()
+
+
+def test_requests_wait_for_a_planner_that_is_busy(both):
+    planner, _ = both
+    process = stopped(planner)
+    resume = threading.Timer(0.5, process.resume)
+    resume.start()
+    numbers = [planner.request(Wish.REPLACE, 100 * FAR) for _ in range(200)]  # more than the pipe holds
+    resume.join()
+    assert len(numbers) == 200
 
 
 def test_what_is_no_proposal_is_none(held):
