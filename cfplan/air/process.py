@@ -55,8 +55,7 @@ class AirPlanner:
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
         """Send a request; return its number, which its answer names. A planner that has ended never answers.
 
-        Where the pipe is full of earlier requests, wait for the planner to read them; raises RequestRefusedError if it
-        hangs.
+        Waits up to 2 s where the pipe is full of unread requests. Raises RequestRefusedError if it is still full then.
         """
         points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
         self._number += 1

@@ -54,7 +54,7 @@ class RealTimeSteering:
         self._change = threading.Condition()
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
-        self._abandoned = False  # whether the program's main thread has ended, so that the vehicle was told to land
+        self._abandoned = False  # the program's main thread has ended, and the vehicle was told to land
         self._unanswered: set[int] = set()
         self._fault: BaseException | None = None  # in the thread that listens to the planner
         self.planner: AirPlanner | None = None

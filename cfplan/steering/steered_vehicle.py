@@ -201,10 +201,10 @@ class SteeredVehicle:
         return answer
 
     def request(self, wish: Wish, waypoints: ArrayLike = ()) -> int:
-        """Request a change and return at once, with the number of its answer.
+        """Request a change and return the number of its answer, without waiting for the answer.
 
-        The latest request wins: one that waits to be planned is superseded. Raises InputError for invalid
-        waypoints.
+        The latest request wins: one that waits to be planned is superseded. If many earlier requests are still unread,
+        this waits for up to 2 s. Raises InputError for invalid waypoints, and RequestRefusedError if they stay unread.
         """
         self._require_flying()
         points = checked_waypoints(waypoints) if wish in (Wish.EXTEND, Wish.REPLACE) else ()

@@ -324,9 +324,9 @@ def _least_off_path(
 def _least_of_tubes(boxes: NDArray, rows: NDArray, others: NDArray, rows_of_others: NDArray, back: int) -> NDArray:
     """Return the least distances, (N,) m, of boxes, (R, S, 2, 3), to those of another vehicle.
 
-    Row n compares tube `rows[n]` with each tube of `rows_of_others[n]`, part by part in time. Their last setpoints may
-    be a period apart, so each part is compared with the one before and the next one too. From part `back` on, each is
-    compared with all later ones, as one of the vehicles may stay where it is.
+    Row n compares tube `rows[n]` with each tube of `rows_of_others[n]`, part by part in time. The last setpoints of
+    the two vehicles may be a period apart, so each part is compared with the parts before and after it too. From part
+    `back` on, each is compared with every part from `back` on, because either vehicle may stop there.
     """
     out = np.full(len(rows), np.inf)
     parts, parts_of_others = boxes.shape[1], others.shape[1]
