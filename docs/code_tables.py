@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cfplan.air.core import PILOT_ANSWER_TIMEOUT
+from cfplan.air.process import PLANNER_ANSWER_TIMEOUT
 from cfplan.errors import ExitCode
 from cfplan.flight.firmware import TIMEOUTS, Timeouts, version_text
 from cfplan.flight.fleet.dongle_process import DONGLE_SILENT
@@ -37,7 +38,6 @@ from cfplan.flight.radio.session import TABLES_TIMEOUT
 from cfplan.flight.setpoints.stops import DURATION as STOP_DURATION
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.virtual_crazyflie.supervisor import Settings
-from cfplan.steering.steered_vehicle import PLANNER_ANSWER_TIMEOUT
 
 MARKER = re.compile(r"<!-- render: (\S+) -->")
 LIMITS = load_limits(Path(__file__).parent.parent / "safety.yaml")

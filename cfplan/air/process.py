@@ -11,6 +11,7 @@ import os
 import select
 import signal
 import sys
+import threading
 from collections.abc import Sequence
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
@@ -20,7 +21,7 @@ import numpy as np
 from cfplan.air.background import ChecksByProcess, do_checks_by
 from cfplan.air.core import FIRST_PART, Answered, Asked, Begun, Event, Make, Propose, Tell, first_state, step
 from cfplan.air.replanning import next_part, replan
-from cfplan.air.requests import PathAnswer, PathRequest, Wish
+from cfplan.air.requests import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.air.stopping import halt
 from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError, RequestRefusedError
@@ -30,17 +31,18 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 
+PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which the planner counts as not answering
+PLANNER_GONE = "the planner's process has ended; the vehicle flies what is committed, and then hovers"
 PRIORITY = -10  # niceness of the planner, if allowed: below the pilot, above all else
 _GARBAGE = 100_000  # allocations after which garbage is collected in any case
 _SWITCH_INTERVAL = 0.0002  # s, after which a thread that waits for the interpreter gets it
 _CLOSE_WITHIN = 1.0  # s
-_READ_WITHIN = 2.0  # s; during a job, which is much shorter, requests fill the pipe
 _FIRST_JOBS = 1.0, 0.1  # s to assume for a plan and for a stop if warming up made none
 _MIDDLE = 0.4, 0.6  # fractions of the space's size: the places that plans of the warm-up lead to
 
 
 class AirPlanner:
-    """The main process's handle of the planner process; a context manager."""
+    """The main process's handle of the planner process; a context manager. Any thread may ask, one may hear answers."""
 
     def __init__(self, timeline: Timeline, limits: Limits, pilot: Connection):
         """Start the process; the pilot's mission was made from `timeline`, `pilot` is the pipe for proposals."""
@@ -49,26 +51,39 @@ class AirPlanner:
         self._process = context.Process(target=_run, args=(timeline, limits, requests_end, pilot), name="planner")
         self._process.start()
         requests_end.close()
+        self._asking = threading.Lock()
         self._number = 0
+        self._unanswered: set[int] = set()
         self.ready = False  # whether it has reported that it can plan
 
     def request(self, wish: Wish, waypoints: Sequence[Triple] = ()) -> int:
-        """Send a request; return its number, which its answer names. A planner that has ended never answers.
+        """Send a request; return its number, which its answer names.
 
-        Waits up to 2 s where the pipe is full of unread requests. Raises RequestRefusedError if it is still full then.
+        Waits while the pipe is full of requests that the planner has not read. Raises RequestRefusedError if it reads
+        none within PLANNER_ANSWER_TIMEOUT.
         """
         points = tuple((float(x), float(y), float(z)) for x, y, z in waypoints)
-        self._number += 1
-        with contextlib.suppress(OSError):
-            if not select.select([], [self._requests], [], _READ_WITHIN)[1]:
-                raise RequestRefusedError(
-                    "the planner no longer reads requests", where="planner", hint="land: the vehicle flies on"
-                )
-            self._requests.send(PathRequest(self._number, wish, points))
-        return self._number
+        with self._asking:
+            self._number += 1
+            number = self._number
+            self._unanswered.add(number)
+            with contextlib.suppress(OSError):  # it has ended, which `answers` tells
+                if not select.select([], [self._requests], [], PLANNER_ANSWER_TIMEOUT)[1]:
+                    self._unanswered.discard(number)
+                    raise RequestRefusedError(
+                        f"the planner has read no request for {PLANNER_ANSWER_TIMEOUT:g} s",
+                        where="planner",
+                        hint="land; until then the vehicle flies its committed path and hovers at its end",
+                    )
+                self._requests.send(PathRequest(number, wish, points))
+        return number
 
     def answers(self, patience: float = 0.0) -> list[PathAnswer]:
-        """Return the answers since the last call; wait up to `patience`, s, for the first."""
+        """Return the answers since the last call; wait up to `patience`, s, for the first.
+
+        Once the process has ended, what it left unanswered is refused.
+        """
+        gone = not self.alive
         found: list[PathAnswer] = []
         with contextlib.suppress(EOFError, OSError):
             while self._requests.poll(0.0 if found else patience):
@@ -77,6 +92,11 @@ class AirPlanner:
                     found.append(message)
                 else:
                     self.ready, patience = True, 0.0
+        self._unanswered.difference_update(answer.number for answer in found)
+        if gone:
+            left = sorted(self._unanswered)
+            self._unanswered.difference_update(left)
+            found += [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in left]
         return found
 
     @property

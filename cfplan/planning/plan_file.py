@@ -31,7 +31,7 @@ RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
 _HINT = "make it again with `cfplan plan`"
-_JUMP_TOLERANCE = 1e-6  # relative to the size of each derivative
+_JUMP_TOLERANCE = 1e-6  # of jump / (1 + |value|), for the position and each derivative
 
 
 def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:
@@ -135,7 +135,7 @@ def _rebuilt(metadata: dict[str, Any]) -> Plan:
 
 
 def _jump(path: Path) -> float:
-    """Return how far the path or one of its first three derivatives jumps between two pieces, relative to its size."""
+    """Return the largest jump / (1 + |value|) between two pieces, of the path and its first three derivatives."""
     at, left = path.breaks[1:-1], np.arange(len(path.breaks) - 2)
     before, behind = (derivatives_on(path.origins, path.coefficients, at, piece)[:4] for piece in (left, left + 1))
     return float(np.max(np.abs(before - behind) / (1.0 + np.abs(before)), initial=0.0))

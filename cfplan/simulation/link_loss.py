@@ -348,9 +348,9 @@ def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) 
 
 
 def _keep_drift(boxes: NDArray, schedule: Schedule, floor: float) -> None:
-    """Widen the boxes, (F, S, 2, 3) m, of a vehicle that lies on the `floor`, m, by its drift until it came down.
+    """Widen the boxes, (F, S, 2, 3) m, of vehicles that lie on the `floor`, m, by the drift that they landed with.
 
-    Boxes after the end of the simulation repeat the last one, in which the vehicle came down; they end at the floor.
+    Boxes after the end of the simulation repeat the one in which the vehicle came down; their tops become the floor.
     """
     lies = boxes[:, :, 1, 2] <= floor
     steps = lies.argmax(axis=1) * schedule.part // schedule.step

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 from cfplan.air.process import AirPlanner
-from cfplan.air.requests import PathAnswer, PathVerdict, Wish
+from cfplan.air.requests import Wish
 from cfplan.air.timeline import Timeline
 from cfplan.errors import CfplanError
 from cfplan.flight.clock import REAL_CLOCK
@@ -24,7 +24,6 @@ from cfplan.steering.flight_in_progress import Listeners
 from cfplan.steering.starting_vehicle import StartingVehicle
 from cfplan.vehicle.rotations import yaw_of
 
-PLANNER_GONE = "the planner's process has ended; the vehicle flies what is committed, and then hovers"
 _LISTEN_PERIOD = 0.05  # s
 _LANDING = 120.0  # s, longest landing
 _PLANNER_STARTS = 60.0  # s, longest start of its process, with compiling
@@ -55,7 +54,6 @@ class RealTimeSteering:
         self._orders: deque[Order] = deque()
         self._more_orders = more_orders
         self._abandoned = False  # the program's main thread has ended, and the vehicle was told to land
-        self._unanswered: set[int] = set()
         self._fault: BaseException | None = None  # in the thread that listens to the planner
         self.planner: AirPlanner | None = None
         self._thread: threading.Thread | None = None
@@ -120,22 +118,16 @@ class RealTimeSteering:
             self.order(Order.LAND)
 
     def _listen(self, listeners: Listeners) -> None:
-        """Pass the planner's answers on, and answer for it once it has ended."""
+        """Pass the planner's answers on."""
         planner = self.planner
         assert planner is not None
         while self.outcome is None:
             answers = planner.answers(_LISTEN_PERIOD)
-            gone = not planner.alive
             with self._change:
-                if gone:
-                    answered = {answer.number for answer in answers}
-                    left = sorted(self._unanswered - answered)
-                    answers += [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in left]
                 for answer in answers:
-                    self._unanswered.discard(answer.number)
                     listeners.answer(answer)
                 self._change.notify_all()
-            if gone:
+            if not planner.alive:  # then it does not wait for answers
                 REAL_CLOCK.sleep(_LISTEN_PERIOD)
 
     def _next_orders(self) -> Iterator[Order]:
@@ -148,10 +140,7 @@ class RealTimeSteering:
 
     def ask(self, wish: Wish, waypoints: Sequence[Triple]) -> int:
         assert self.planner is not None
-        with self._change:
-            number = self.planner.request(wish, waypoints)
-            self._unanswered.add(number)
-        return number
+        return self.planner.request(wish, waypoints)
 
     def order(self, order: Order) -> None:
         self._orders.append(order)

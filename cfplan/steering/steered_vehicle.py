@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cfplan.air.process import PLANNER_ANSWER_TIMEOUT
 from cfplan.air.requests import PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.air.timeline import hold_hover
 from cfplan.errors import (
@@ -40,7 +41,6 @@ from cfplan.steering.recorded_steering import SteeringRecord, answer_text
 
 MAX_WAYPOINTS = 200  # per request
 _TAKE_OFF_TIMEOUT = 120.0  # s, preflight and its waits included
-PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which the planner counts as not answering
 _LAND_TIMEOUT = 120.0  # s
 _FLYING = (Phase.STREAM, Phase.HOLD)
 
@@ -203,8 +203,9 @@ class SteeredVehicle:
     def request(self, wish: Wish, waypoints: ArrayLike = ()) -> int:
         """Request a change and return the number of its answer, without waiting for the answer.
 
-        The latest request wins: one that waits to be planned is superseded. If many earlier requests are still unread,
-        this waits for up to 2 s. Raises InputError for invalid waypoints, and RequestRefusedError if they stay unread.
+        The latest request wins: one that waits to be planned is superseded. If many requests are unread, this waits
+        until the planner has read some. Raises InputError for invalid waypoints, and RequestRefusedError if the planner
+        hangs.
         """
         self._require_flying()
         points = checked_waypoints(waypoints) if wish in (Wish.EXTEND, Wish.REPLACE) else ()

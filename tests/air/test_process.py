@@ -3,6 +3,7 @@
 import multiprocessing
 import signal
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from slow_cases import slow_unless
 from waiting import PATIENCE, a_moment, until
 
 from cfplan.air.core import NO_ANSWER, NOT_FLOWN, ON_ITS_WAY
-from cfplan.air.process import AirPlanner
+from cfplan.air.process import PLANNER_GONE, AirPlanner
 from cfplan.air.replanning import replan
 from cfplan.air.requests import PathAnswer, PathVerdict, Wish
 from cfplan.air.timeline import hold
@@ -244,35 +245,48 @@ def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(bot
     begin(planner, pilot)
     process = stopped(planner)
     process.send_signal(how)
+    killed = how is signal.SIGKILL
+    assert until(lambda: planner.alive is not killed)
     for wish, waypoints in ((Wish.REPLACE, [(0.0, 0.5, 1.0)]), (Wish.STOP, ())):
-        planner.request(wish, waypoints)
+        number = planner.request(wish, waypoints)
         a_moment()
         pilot.tick()
+        assert planner.answers() == ([PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE)] if killed else [])
     assert pilot.commitment is held.commitment
-    assert planner.answers() == []
 
 
-def test_a_request_is_refused_if_the_planner_hangs(both):
+def test_a_request_is_refused_if_the_planner_hangs_and_those_that_it_has_not_read_if_it_then_dies(both):
     planner, _ = both
     process = stopped(planner)
+    numbers: list[int] = []
 
     def fill() -> None:
-        for _ in range(1000):  # far more than the pipe holds
-            planner.request(Wish.REPLACE, 100 * FAR)
+        numbers.extend(planner.request(Wish.REPLACE, 100 * FAR) for _ in range(1000))  # far more than the pipe holds
 
-    with pytest.raises(RequestRefusedError, match=r"no longer reads"):
+    with pytest.raises(RequestRefusedError, match=r"has read no request for"):
         fill()
-    process.resume()
+    assert planner.answers() == []
+    process.kill()
+    assert until(lambda: not planner.alive)
+    assert planner.answers() == [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in numbers]
 
 
-def test_requests_wait_for_a_planner_that_is_busy(both):
-    planner, pilot = both
+def test_requests_wait_for_a_planner_that_is_busy_and_its_answers_are_heard_meanwhile(both):
+    planner, _ = both
     process = stopped(planner)
     resume = threading.Timer(0.5, process.resume)
     resume.start()
-    last = max(planner.request(Wish.REPLACE, 100 * FAR) for _ in range(200))  # more than the pipe holds
+    with ThreadPoolExecutor(2) as threads:
+        asked = [threads.submit(planner.request, Wish.REPLACE, 100 * FAR) for _ in range(400)]  # the pipe holds fewer
+        told: set[int] = set()
+
+        def all_answered() -> bool:
+            told.update(answer.number for answer in planner.answers())
+            return len(told) == len(asked)
+
+        assert until(all_answered)
     resume.join()
-    assert answer_to(last, planner, pilot).verdict is PathVerdict.REFUSED  # nothing is flown yet
+    assert told == {each.result() for each in asked}
 
 
 def test_what_is_no_proposal_is_none(held):

@@ -8,8 +8,8 @@ import pytest
 from stepped_flight import Flight
 from waiting import PATIENCE
 
-from cfplan.air.process import AirPlanner
-from cfplan.air.requests import PathAnswer, Wish
+from cfplan.air.process import PLANNER_GONE, AirPlanner
+from cfplan.air.requests import PathAnswer, PathVerdict, Wish
 from cfplan.air.timeline import hold
 from cfplan.errors import ExitCode
 from cfplan.flight.mocap.source import pose_source
@@ -47,7 +47,7 @@ def fly_with_planner(lab, patient_mission):
 
             source = pose_source(lab.mocap_uri, mission.limits.pose, open_within=PATIENCE)
             outcome = fly(mission, uri=lab.uri, pose_source=source, pilot=pilot, on_telemetry=note)
-            answers += planner.answers(1.0) if planner.alive else []
+            answers += planner.answers(1.0)
         return Flight(outcome, telemetry, lab.truth()), answers
 
     return flight
@@ -65,5 +65,6 @@ def test_without_its_planner_a_flight_ends_on_what_is_committed(fly_with_planner
     flight, answers = fly_with_planner(react)
     assert flight.outcome.exit_code is ExitCode.OK, flight.outcome.reason
     assert done
-    assert answers == []
+    refused = [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in done]
+    assert answers == (refused if how is signal.SIGKILL else [])
     np.testing.assert_allclose(flight.truth.position[-1, :2], WAYPOINTS[-1, :2], atol=0.15)

@@ -49,8 +49,8 @@ STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: erro
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
-FOR_ORDERS = 0.01  # s that an order to brake may arrive later at one pilot than at another
-"""The certificate contains both differences in one skew, so clocks of vehicles may differ by the skew less this."""
+FOR_ORDERS = 0.01  # s, largest difference between the arrivals of an order to brake at two pilots
+"""The certified skew covers this and the difference between the delays of two starts, which may be the rest of it."""
 OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
@@ -232,10 +232,11 @@ class Conductor:
         begun = [each.late for each in self._vehicles.values() if each.late > -math.inf]
         apart, allowed = max(begun) - min(begun), self._skew - FOR_ORDERS
         if vehicle.late > self._skew:
-            self._brake(f"{vehicle.name}: it began {vehicle.late:.3f} s late (limit {self._skew:.3f} s)")
+            self._brake(f"{vehicle.name}: it began its path {vehicle.late:.3f} s late (limit {self._skew:.3f} s)")
         elif apart > allowed:
             self._brake(
-                f"{vehicle.name}: its clock and that of another differ by {apart:.3f} s (limit {allowed:.3f} s)"
+                f"{vehicle.name}: its start and that of another were late by times that differ by {apart:.3f} s "
+                f"(limit {allowed:.3f} s)"
             )
 
     def _brake(self, reason: str) -> None:

@@ -146,8 +146,9 @@ class LossModel:
     def tubes_apart(self, tube: Tube, own: NDArray, other: Tube, own_of_other: NDArray, skew: float) -> NDArray:
         """Return the least distance, (N,) m, between the tubes of two vehicles that lose their links together.
 
-        `own` and `own_of_other`, (N,) s, are the times of both clocks at one moment, uncertain by `skew`, s. A vehicle
-        whose link comes back stays where it is then; tubes of flights on board contain that themselves.
+        `own` and `own_of_other`, (N,) s, are the times on both plans at the same N moments; their difference is
+        uncertain by ±`skew`, s. A vehicle whose link comes back stays where it is then; tubes of flights on board
+        contain that themselves.
         """
         late = int(np.ceil(skew * tube.rate))
         rows = tube.rows(own), other.rows(own_of_other[:, None] + np.arange(-late, late + 1) / tube.rate)

@@ -213,7 +213,7 @@ def test_all_brake_when_a_vehicle_on_board_must_be_told_again_to_begin(again, br
         fleet.hear("right", setpoint(begins + 0.03 + again + 0.01 * index, (0.5, 0.0, 0.6), index))
     said = fleet.go_on(0.01)
     assert bool(braking(said)) is brakes
-    assert ("right: it began 0.330 s late" in said["left"].brakes) is brakes
+    assert ("right: it began its path 0.330 s late" in said["left"].brakes) is brakes
 
 
 def test_a_pilot_that_hears_of_its_start_too_late_has_braked_before():

@@ -227,7 +227,7 @@ def test_an_order_to_arm_or_disarm_that_the_radio_swallows_is_sent_again(world, 
     assert not world.armed
 
 
-def test_a_status_from_before_the_order_confirms_no_disarming(world, fly):
+def test_a_status_from_before_the_order_does_not_confirm_disarming(world, fly):
     """As if the vehicle had been armed so lately that its newest status does not show it yet."""
 
     def show_unarmed() -> None:
