@@ -31,7 +31,7 @@ from cfplan.flight.setpoints.encoding import RATE
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import Limits
 
-PLANNER_ANSWER_TIMEOUT = 15.0  # s, after which the planner counts as not answering
+PLANNER_ANSWER_TIMEOUT = 15.0  # s without reading or answering a request, after which the planner counts as hung
 PLANNER_GONE = "the planner's process has ended; the vehicle flies what is committed, and then hovers"
 PRIORITY = -10  # niceness of the planner, if allowed: below the pilot, above all else
 _GARBAGE = 100_000  # allocations after which garbage is collected in any case
@@ -42,7 +42,11 @@ _MIDDLE = 0.4, 0.6  # fractions of the space's size: the places that plans of th
 
 
 class AirPlanner:
-    """The main process's handle of the planner process; a context manager. Any thread may ask, one may hear answers."""
+    """The main process's handle of the planner process; a context manager.
+
+    Any thread may send requests. One thread reads the answers, and must keep reading: a planner that cannot send its
+    answers stops reading requests.
+    """
 
     def __init__(self, timeline: Timeline, limits: Limits, pilot: Connection):
         """Start the process; the pilot's mission was made from `timeline`, `pilot` is the pipe for proposals."""
@@ -67,7 +71,7 @@ class AirPlanner:
             self._number += 1
             number = self._number
             self._unanswered.add(number)
-            with contextlib.suppress(OSError):  # it has ended, which `answers` tells
+            with contextlib.suppress(OSError):  # the process has ended: `answers` refuses the request
                 if not select.select([], [self._requests], [], PLANNER_ANSWER_TIMEOUT)[1]:
                     self._unanswered.discard(number)
                     raise RequestRefusedError(
@@ -81,7 +85,7 @@ class AirPlanner:
     def answers(self, patience: float = 0.0) -> list[PathAnswer]:
         """Return the answers since the last call; wait up to `patience`, s, for the first.
 
-        Once the process has ended, what it left unanswered is refused.
+        Once the process has ended, every request that it left unanswered is refused.
         """
         gone = not self.alive
         found: list[PathAnswer] = []

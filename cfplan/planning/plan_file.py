@@ -31,7 +31,7 @@ RATE = 100  # Hz, of the samples
 _KEY = b"cfplan"
 _AXES = ("x", "y", "z", "w")
 _HINT = "make it again with `cfplan plan`"
-_JUMP_TOLERANCE = 1e-6  # of jump / (1 + |value|), for the position and each derivative
+_JUMP_TOLERANCE = 1e-6  # largest allowed jump / (1 + |value|), of the position and each derivative
 
 
 def save_plan(plan: Plan, file: FilePath | str, provenance: Mapping[str, str] | None = None) -> None:

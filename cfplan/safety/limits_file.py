@@ -45,7 +45,7 @@ _PLANNING_MINIMA = {
 """Lower bounds of planning limits: slower motion would be hidden by noise of gyroscope and poses."""
 
 _PEAK_OVER_MEAN = {"take_off_speed": 15 / 8, "go_to_speed": 15 / 8, "land_speed": 1.5}
-"""Largest over mean speed of the motions that `ground` gives a mean speed: between two hovers, and of a landing."""
+"""Ratio of largest to mean speed, for the mean speeds under `ground`: motions between two hovers, and landing."""
 _PEAK_ACCELERATION = 10 / math.sqrt(3)  # m/s², of a motion between two hovers over 1 m in 1 s
 
 _LOOKED_AT = 65  # grid points along each side of the room, for places to take off to

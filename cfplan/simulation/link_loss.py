@@ -348,7 +348,7 @@ def _lose_link(forks: _Forks, limits: Limits, error: float, schedule: Schedule) 
 
 
 def _keep_drift(boxes: NDArray, schedule: Schedule, floor: float) -> None:
-    """Widen the boxes, (F, S, 2, 3) m, of vehicles that lie on the `floor`, m, by the drift that they landed with.
+    """Widen the boxes, (F, S, 2, 3) m, of vehicles that lie on the `floor`, m, by the drift at touchdown.
 
     Boxes after the end of the simulation repeat the one in which the vehicle came down; their tops become the floor.
     """

@@ -118,7 +118,7 @@ class RealTimeSteering:
             self.order(Order.LAND)
 
     def _listen(self, listeners: Listeners) -> None:
-        """Pass the planner's answers on."""
+        """Pass the planner's answers to the listeners until the flight has ended."""
         planner = self.planner
         assert planner is not None
         while self.outcome is None:
@@ -127,7 +127,7 @@ class RealTimeSteering:
                 for answer in answers:
                     listeners.answer(answer)
                 self._change.notify_all()
-            if not planner.alive:  # then it does not wait for answers
+            if not planner.alive:  # `answers` returns at once then
                 REAL_CLOCK.sleep(_LISTEN_PERIOD)
 
     def _next_orders(self) -> Iterator[Order]:

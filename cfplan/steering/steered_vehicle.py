@@ -205,7 +205,7 @@ class SteeredVehicle:
 
         The latest request wins: one that waits to be planned is superseded. If many requests are unread, this waits
         until the planner has read some. Raises InputError for invalid waypoints, and RequestRefusedError if the planner
-        hangs.
+        reads none for 15 s.
         """
         self._require_flying()
         points = checked_waypoints(waypoints) if wish in (Wish.EXTEND, Wish.REPLACE) else ()

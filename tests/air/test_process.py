@@ -255,38 +255,40 @@ def test_a_planner_that_is_killed_or_stopped_leaves_the_pilot_its_commitment(bot
     assert pilot.commitment is held.commitment
 
 
-def test_a_request_is_refused_if_the_planner_hangs_and_those_that_it_has_not_read_if_it_then_dies(both):
+def test_a_hung_planner_refuses_a_request_and_its_death_refuses_those_it_has_not_read(both):
     planner, _ = both
     process = stopped(planner)
     numbers: list[int] = []
 
     def fill() -> None:
-        numbers.extend(planner.request(Wish.REPLACE, 100 * FAR) for _ in range(1000))  # far more than the pipe holds
+        while len(numbers) < 1000:  # far more than the pipe holds
+            numbers.append(planner.request(Wish.REPLACE, 100 * FAR))
 
-    with pytest.raises(RequestRefusedError, match=r"has read no request for"):
+    with pytest.raises(RequestRefusedError, match="has read no request for"):
         fill()
+    assert numbers
     assert planner.answers() == []
     process.kill()
     assert until(lambda: not planner.alive)
     assert planner.answers() == [PathAnswer(number, PathVerdict.REFUSED, PLANNER_GONE) for number in numbers]
 
 
-def test_requests_wait_for_a_planner_that_is_busy_and_its_answers_are_heard_meanwhile(both):
+def test_requests_wait_for_a_busy_planner_while_its_answers_are_read(both):
     planner, _ = both
     process = stopped(planner)
     resume = threading.Timer(0.5, process.resume)
     resume.start()
     with ThreadPoolExecutor(2) as threads:
         asked = [threads.submit(planner.request, Wish.REPLACE, 100 * FAR) for _ in range(400)]  # the pipe holds fewer
-        told: set[int] = set()
+        answered: set[int] = set()
 
         def all_answered() -> bool:
-            told.update(answer.number for answer in planner.answers())
-            return len(told) == len(asked)
+            answered.update(answer.number for answer in planner.answers())
+            return len(answered) == len(asked)
 
         assert until(all_answered)
     resume.join()
-    assert told == {each.result() for each in asked}
+    assert answered == {each.result() for each in asked}
 
 
 def test_what_is_no_proposal_is_none(held):

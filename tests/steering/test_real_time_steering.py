@@ -2,13 +2,14 @@
 
 import pickle
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from unittest.mock import Mock
 
 import pytest
-from waiting import until
+from waiting import PATIENCE, until
 
-from cfplan.air.requests import PathAnswer, PathVerdict
+from cfplan.air.requests import PathAnswer, PathVerdict, Wish
 from cfplan.errors import CfplanError
 from cfplan.flight.pilot.keys import Order
 from cfplan.preparation.steps import ignore_steps
@@ -64,3 +65,32 @@ def test_a_fault_in_hearing_the_planner_lands_the_vehicle_and_is_said(monkeypatc
     flight.close()
     assert isinstance(flight.outcome, CfplanError)
     assert fault in str(flight.outcome)
+
+
+def test_answers_and_telemetry_are_heard_while_a_request_waits_for_the_planner(monkeypatch):
+    read = threading.Event()  # by the planner
+    heard: list[object] = []
+
+    def request(*_) -> int:
+        assert read.wait(PATIENCE)
+        return 7
+
+    def fly(*_, on_telemetry, **__):
+        assert until(lambda: heard)  # an answer, so the request waits
+        on_telemetry("pose")
+        assert until(lambda: read.is_set())
+
+    planner = Mock(ready=True, alive=True, request=request, answers=lambda _: [PathAnswer(1, PathVerdict.REFUSED)])
+    monkeypatch.setattr(real_time_steering, "StartingVehicle", lambda *_: nullcontext(Mock()))
+    monkeypatch.setattr(real_time_steering, "AirPlanner", lambda *_: nullcontext(planner))
+    monkeypatch.setattr(real_time_steering, "fly", fly)
+    flight = RealTimeSteering("sim://0", None, Mock(), ignore_steps, keys=False)
+    flight.planner = planner
+    with ThreadPoolExecutor(1) as program:
+        asked = program.submit(flight.ask, Wish.STOP, ())
+        flight.start(Mock(), Mock(), Listeners(heard.append, heard.append))
+        assert until(lambda: "pose" in heard)
+        assert not asked.done()
+        read.set()
+        assert asked.result(PATIENCE) == 7
+    flight.close()

@@ -67,7 +67,7 @@ def test_the_readmes_example_flies_and_is_recorded(connect, limits):
     assert vehicle.summary["peak_speed"] > 1.0
 
 
-def test_the_outcome_is_told_although_the_summary_cannot_be_written(connect):
+def test_the_outcome_is_reported_even_if_the_summary_cannot_be_written(connect):
     with connect() as vehicle:
         vehicle.take_off(0.8)
         (vehicle.record / "summary.json").mkdir()

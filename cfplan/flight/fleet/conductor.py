@@ -50,7 +50,7 @@ PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehi
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 FOR_ORDERS = 0.01  # s, largest difference between the arrivals of an order to brake at two pilots
-"""The certified skew covers this and the difference between the delays of two starts, which may be the rest of it."""
+"""The certified skew covers this plus the difference between the delays of two starts."""
 OBEYS_LATE = 0.05  # s from a command to a vehicle that flies on board until it obeys; a command sent again comes later
 RISEN = 0.15  # m above where it stood, from which on a vehicle has taken off
 _POSES = 32  # of each vehicle that are remembered, and as many setpoints
@@ -193,7 +193,7 @@ class Conductor:
                 if vehicle.phase is Phase.STREAM and not vehicle.left:
                     late = due - index / RATE - vehicle.cleared.get(Phase.STREAM, -math.inf)
                     vehicle.late = max(vehicle.late, late)  # less where a stalled pilot skips setpoints
-                    self._compare_clocks(vehicle)
+                    self._compare_start_delays(vehicle)
             case PhaseEntered(phase=phase):
                 if phase is Phase.DISARM and Phase.ARM in vehicle.cleared and not vehicle.descending:
                     self._brake(f"{name}: its flight ended before it landed")  # its reason comes later, with its end
@@ -227,7 +227,7 @@ class Conductor:
         """Return why a vehicle must brake; one that has flown its plan lands anyway."""
         return "" if vehicle.descending and not vehicle.left else self.brakes
 
-    def _compare_clocks(self, vehicle: _Vehicle) -> None:
+    def _compare_start_delays(self, vehicle: _Vehicle) -> None:
         """Let all brake if a plan began too late, by itself or compared with that of another vehicle."""
         begun = [each.late for each in self._vehicles.values() if each.late > -math.inf]
         apart, allowed = max(begun) - min(begun), self._skew - FOR_ORDERS
@@ -235,7 +235,7 @@ class Conductor:
             self._brake(f"{vehicle.name}: it began its path {vehicle.late:.3f} s late (limit {self._skew:.3f} s)")
         elif apart > allowed:
             self._brake(
-                f"{vehicle.name}: its start and that of another were late by times that differ by {apart:.3f} s "
+                f"{vehicle.name}: the delays of its start and of another's differ by {apart:.3f} s "
                 f"(limit {allowed:.3f} s)"
             )
 
