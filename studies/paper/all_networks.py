@@ -1,7 +1,6 @@
 """Train the networks of the paper's simulated tables one after another; a training that was stopped resumes."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -13,12 +12,11 @@ from studies.paper.sequences import read_sequences
 from studies.paper.trained import DATA_COMMAND, TESTED
 from studies.paper.training import Training, load_network, train_network
 
-ROBUST_SEEDS = architectures.Settings().seeds  # trainings of each LSTM of the table of perturbed paths
 ALL = MappingProxyType({
     each.name: each
     for each in (
         *architectures.wanted(architectures.Settings()), *inputs.WANTED,
-        *(replace(each, seed=seed) for seed in range(ROBUST_SEEDS) for each in robustness.MODELS.values()),
+        *robustness.MODELS.values(),
     )
 })  # fmt: skip
 """The networks by name, in the order in which they are trained."""

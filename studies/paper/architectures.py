@@ -46,7 +46,7 @@ from studies.runner.study import Run, Study, Work
 SHIPPED_LIMITS = LIMIT_SETS["simulation"]
 SHIPPED_NODES = 100
 AS_BYTES = "the shipped planner, as bytes"
-ABLATED = (replace(OURS, slopes=0.0), replace(SequenceOptions(), slopes=OURS.slopes))  # one part of OURS at a time
+LOSS_OF_PAPER = replace(OURS, slopes=0.0)  # shows what the loss of OURS changes
 OF_KIND = MappingProxyType({kind: SequenceOptions(kind=kind) for kind in Kind} | {OURS.kind: OURS})
 SEVERAL = (Kind.LSTM, Kind.BIDIRECTIONAL)  # architectures that are trained with several seeds
 
@@ -87,7 +87,7 @@ def wanted(settings: Settings) -> list[SequenceOptions]:
         for kind in settings.kinds
         for seed in range(settings.seeds if kind in SEVERAL else 1)
     ]
-    return [*compared, *(each for each in ABLATED if OURS.kind in settings.kinds and each.kind in settings.kinds)]
+    return [*compared, *([LOSS_OF_PAPER] if OURS.kind in settings.kinds else [])]
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:

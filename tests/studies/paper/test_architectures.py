@@ -54,7 +54,7 @@ def test_what_the_paper_prints_is_consistent_where_it_prints_twice():
         (
             architectures,
             architectures.Settings(paths=1, quick=True, seeds=2),
-            [TOPPQUAD, "expert", *list(Kind)[:-1], OURS.model, "BiLSTM", "LSTM-slopes-10", SHIPPED],
+            [TOPPQUAD, "expert", *list(Kind)[:-1], OURS.model, "BiLSTM", SHIPPED],
         ),
         (inputs, NetworkSettings(paths=1, quick=True), [TOPPQUAD, *Inputs]),
     ],
