@@ -90,6 +90,7 @@ class Settings:
     paths: int = option(8, "Paths in the room, the first a straight line; the long one is flown besides.", least=1)
     learned_from: int = option(9000, "Paths that networks learn from, for each set of limits.", least=10)
     data: FilePath = option(DATA, "Folder of datasets and networks; missing ones are made.")
+    limits: tuple[str, ...] = option(tuple(LIMITS), "Set of limits that the paper states.", choices=tuple(LIMITS))
     epochs: int | None = option(None, EPOCHS, least=1)
     quick: bool = option(False, QUICK)
 
@@ -134,7 +135,7 @@ def work(settings: Settings, run: Run) -> Work:
     """
     usual = load_limits(DEFAULTS)
     paths = hardware_paths(usual, settings.paths) | ({} if settings.quick else {LONG: long_path(usual)})
-    networks = {name: _networks(settings, run, name) for name in list(LIMITS)[: 1 if settings.quick else None]}
+    networks = {name: _networks(settings, run, name) for name in settings.limits[: 1 if settings.quick else None]}
     identity = {name: identities(own.values()) for name, own in networks.items()}
     most = 1 if settings.quick else LEARNED_FLIGHTS
     return Work(plans_of(networks, paths), partial(measure, networks, paths, most), HardwareFlight, identity)
@@ -312,7 +313,7 @@ COLUMNS = (
 def tables(settings: Settings, rows: list[HardwareFlight]) -> Iterator[Table]:
     """Yield the paper's table, the same for the straight line and the long path alone, and the trainings."""
     number = len({row.path for row in rows} - {LONG})
-    pairs = ", ".join(f"{name} {first:g} m/s² and {second:g} rad/s" for name, (first, second) in LIMITS.items())
+    pairs = ", ".join("{} {:g} m/s² and {:g} rad/s".format(name, *LIMITS[name]) for name in settings.limits)
     title = f"{number} paths in the room, 2 m/s; limits: {pairs}"
     by = ("limits", "way", "planner")
     yield table("hardware", title, COLUMNS, [row for row in rows if row.path != LONG], by=by)
