@@ -66,7 +66,7 @@ MODELS = MappingProxyType(
             *(SequenceOptions(epsilon=epsilon) for epsilon in SCALES),
             SequenceOptions(epsilon=SCALES[-1], relabel=Relabel.SOLVE),
             OURS,
-            replace(OURS, epsilon=SCALES[-1]),
+            replace(OURS, epsilon=SCALES[-1], relabel=Relabel.SOLVE),
         )
     }
 )
