@@ -21,6 +21,7 @@ from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
 from cfplan.planning.repair import refine, repair
 from cfplan.safety.limit_sets import PAPER
+from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.simulation.geometric_flight import LOST, positions_by_both
 from cfplan.vehicle.airframe import Airframe
@@ -120,7 +121,7 @@ def work(settings: Settings, run: Run) -> Work:
     Raises:
         InputError: neither RotorPy nor drone-models is installed; also as `paper_data`.
     """
-    usual = load_limits(DEFAULTS)
+    usual = _room_limits()
     bodies_for(usual.airframe)
     data = paper_data(settings, run, [SequenceOptions()])
     tested = {str(each.row): each.path for each in data.part(TEST).values()}
@@ -162,7 +163,13 @@ def bodies_for(airframe: Airframe) -> list[OtherBody]:
 
 
 def _airframe(kind: str) -> Airframe:
-    return {PLANNED: PAPER.airframe, SHIPPED: SHIPPED_LIMITS.airframe, HARDWARE: load_limits(DEFAULTS).airframe}[kind]
+    return {PLANNED: PAPER.airframe, SHIPPED: SHIPPED_LIMITS.airframe, HARDWARE: _room_limits().airframe}[kind]
+
+
+def _room_limits() -> Limits:
+    """Return those that `cfplan init` writes, with an airframe that has only the effects that other bodies have."""
+    limits = load_limits(DEFAULTS)
+    return replace(limits, airframe=limits.airframe.simplified())
 
 
 def _by_geometric_controller(trajectory: Trajectory, begun: BodyFlight, body: OtherBody) -> BodyFlight:
@@ -195,7 +202,7 @@ def _planned(network: TrainedNetwork, planner: str, path: Path) -> Trajectory:
 def _sent(asked: Asked) -> tuple[EncodedFlight, Trajectory]:
     """Return the encoded flight along a path, and its trajectory."""
     if asked.table == HARDWARE:
-        way, limits = RAW if asked.planner == TOPPQUAD else CERTIFIED, paper_limits(load_limits(DEFAULTS), TRACKED)
+        way, limits = RAW if asked.planner == TOPPQUAD else CERTIFIED, paper_limits(_room_limits(), TRACKED)
         return encoded_plan(way, asked.planner, None, asked.path, limits)
     task = shipped_task(amid(asked.path))
     trajectory = refine(task, profile_of(plan_learned, task)).trajectory
