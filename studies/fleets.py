@@ -30,7 +30,7 @@ from cfplan.planning.fleet.lost import NOTICED
 from cfplan.planning.fleet.members import FleetMember
 from cfplan.planning.plan_result import Plan
 from cfplan.preparation.plan_fleet import coordinate_fleet, loss_model
-from cfplan.preparation.plan_flight import PlannedFlight, give_way, plan_flight
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, give_way, plan_flight
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits import Limits
 from cfplan.simulation.draws import draw_vehicles
@@ -43,6 +43,7 @@ from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
 _FROM_MARGIN = 0.05  # m that waypoints keep from the margin of the walls, as paths swing out between them
+_WITHOUT_BUDGET = FlightOptions(budget=math.inf)  # or plans would depend on how busy the computer is
 _LONGEST = 4.0  # s from the last setpoint until every vehicle lies on the floor
 
 
@@ -151,7 +152,7 @@ def _planned_vehicles(seed: int, apart: float, limits: Limits) -> Iterator[_Plan
             both = path_file.waypoints[[0, -1], :2]
             if all((np.linalg.norm(both - other, axis=1) >= apart).all() for other in ends):
                 begun = time.process_time()
-                planned = plan_flight(path_file, limits).plan
+                planned = plan_flight(path_file, limits, _WITHOUT_BUDGET).plan
                 ends.append(both)
                 name = f"v{len(ends)}"
                 seconds = time.process_time() - begun
@@ -162,7 +163,7 @@ def _coordinated(fleet: FleetFile, alone: Sequence[FleetMember], limits: Limits)
     """Coordinate a fleet without regard to lost vehicles."""
     row, begun = CoordinatedFleet(fleet.name, len(alone)), time.process_time()
     with suppress(CfplanError):
-        made = coordinate_fleet(fleet, alone, limits, None)
+        made = coordinate_fleet(fleet, alone, limits, None, options=_WITHOUT_BUDGET)
         row.makespan = made.end / made.alone
         row.replanned = bool(made.detours)
     row.seconds = time.process_time() - begun

@@ -1,5 +1,6 @@
 """Plans keep a margin for gaps in setpoints and poses; a file whose plan does not is refused."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.preparation.glitch_assessment import KEPT, assess_glitches
 from cfplan.preparation.local_slowing import slow_locally
-from cfplan.preparation.plan_flight import plan_flight
+from cfplan.preparation.plan_flight import FlightOptions, plan_flight
 from cfplan.preparation.prepare_flight import require_glitch_margin
 from cfplan.simulation.glitches import TURNED_OVER, glitch_at_every_setpoint
 from tests.least_snap import along_least_snap
@@ -30,7 +31,8 @@ def limits(limits):
 @pytest.fixture(scope="module")
 def loop(limits, tmp_path_factory):
     """A plan along a path of least snap, on which gaps lead farther off than on the fastest one."""
-    return plan_flight(along_least_snap("loop3d", tmp_path_factory.mktemp("loop")), limits).plan
+    least_snap = along_least_snap("loop3d", tmp_path_factory.mktemp("loop"))
+    return plan_flight(least_snap, limits, FlightOptions(budget=math.inf)).plan
 
 
 def cut_at(limits, deviation):

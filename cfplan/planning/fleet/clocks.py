@@ -17,12 +17,8 @@ TICK = 0.04  # s of common time, a multiple of the setpoint period
 LEVELS = 4  # rates above 0
 CELL = TICK / LEVELS  # s of a plan's own time
 RAMP = 6  # ticks between rates: 1.04 /s, which from 2 m/s brakes at 2.1 m/s²
-_START, _SAME, _SLOWER, _FASTER = (
-    1,
-    2,
-    4,
-    8,
-)  # how a state was reached: from rest, at the same, a lower, or a higher rate
+# How a state was reached: from rest, at the same, a lower, or a higher rate.
+_START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8
 
 
 class VehicleClock(NamedTuple):
@@ -72,7 +68,7 @@ def fastest_clock(
     how, end, cell, level = _reached(conflict, may_start)
     if level > 0:
         return VehicleClock(*_followed(how, end, cell, level))
-    found = how.any(axis=2)
+    found = how.any(axis=1)
     farthest = int(np.flatnonzero(found.any(axis=0)).max(initial=0))
     return Stuck(CELL * farthest, TICK * float(np.flatnonzero(found[:, farthest]).max(initial=0)))
 
@@ -92,44 +88,57 @@ def _conflicts(own: NDArray, columns: NDArray, apart: float) -> NDArray:
 
 @njit(nogil=True, error_model="numpy")
 def _reached(conflict: NDArray, may_start: NDArray) -> tuple[NDArray, int, int, int]:
-    """Return how each state is reached, (T, U, LEVELS + 1) uint8, and tick, cell and level of the earliest end.
+    """Return how each state is reached, (T, LEVELS + 1, U) uint8, and tick, cell and level of the earliest end.
 
     The level is 0 if no end is reached.
     """
     known, cells = conflict.shape
     end = cells - LEVELS  # the first cell at the end
     ticks = known + cells // LEVELS + LEVELS * RAMP
-    how = np.zeros((ticks, cells, LEVELS + 1), dtype=np.uint8)
+    how = np.zeros((ticks, LEVELS + 1, cells), dtype=np.uint8)
+    free = np.ones((ticks, cells), dtype=np.uint8)  # 1 where there is no conflict; after the last tick all others rest
+    for t in range(ticks):
+        for u in range(cells):
+            free[t, u] = not conflict[min(t, known - 1), u]
     stays = np.ones(ticks + 1, dtype=np.bool_)  # whether it may rest at its end from a tick on
     for t in range(ticks - 1, -1, -1):
-        stays[t] = stays[t + 1] and _free(conflict, t, end)
+        stays[t] = stays[t + 1] and free[t, end] != 0
     for t in range(ticks):
-        if (t == 0 or how[t - 1, 0, 0] != 0) and _free(conflict, t, 0):
+        if (t == 0 or how[t - 1, 0, 0] != 0) and free[t, 0] != 0:
             for level in range(LEVELS + 1 if may_start[min(t, known - 1)] else 1):
-                how[t, 0, level] |= _START
-        for u in range(cells):
+                how[t, level, 0] |= _START
+        for u in range(end, cells if stays[t] else end):
             for level in range(LEVELS, 0, -1):
-                if how[t, u, level] == 0:
-                    continue
-                if u >= end:
-                    if stays[t]:
-                        return how, t, u, level
-                    continue
-                if t + 1 < ticks and _free(conflict, t + 1, u + level):
-                    how[t + 1, u + level, level] |= _SAME
-                for change in (-1, 1):
-                    if 1 <= level + change <= LEVELS and t + RAMP < ticks and u + _passed(level, change, RAMP) <= end:
-                        _ramp(how, conflict, t, u, level, change)
+                if how[t, level, u] != 0:
+                    return how, t, u, level
+        for level in range(1, LEVELS + 1):
+            states = (how[t, level, :end] != 0).view(np.uint8)
+            if t + 1 < ticks:
+                _mark(how[t + 1, level, level:], states & free[t + 1, level : end + level], _SAME)
+            for change in (-1, 1):
+                if 1 <= level + change <= LEVELS and t + RAMP < ticks:
+                    _ramp(how, free, states, t, level, change)
     return how, 0, 0, 0
 
 
 @njit(error_model="numpy")
-def _ramp(how: NDArray, conflict: NDArray, t: int, u: int, level: int, change: int) -> None:
-    """Mark the state after a change of rate as reached, unless there is a conflict on the way."""
+def _ramp(how: NDArray, free: NDArray, states: NDArray, t: int, level: int, change: int) -> None:
+    """Mark the states after a change of rate as reached, unless there is a conflict on the way or the end is passed.
+
+    `states` are 1 for the cells before the end that are reached at the tick and the level.
+    """
+    passed = _passed(level, change, RAMP)
+    kept = states[: max(len(states) + 1 - passed, 0)]  # from these cells, the change ends at the end or before
     for k in range(1, RAMP + 1):
-        if not _free(conflict, t + k, u + _passed(level, change, k)):
-            return
-    how[t + RAMP, u + _passed(level, change, RAMP), level + change] |= _FASTER if change < 0 else _SLOWER
+        kept = kept & free[t + k, _passed(level, change, k) :][: len(kept)]
+    _mark(how[t + RAMP, level + change, passed:], kept, _FASTER if change < 0 else _SLOWER)
+
+
+@njit(error_model="numpy")
+def _mark(how: NDArray, reached: NDArray, way: int) -> None:
+    """Mark the states that are reached in a way."""
+    for u in range(len(reached)):
+        how[u] |= way * reached[u]
 
 
 @njit(error_model="numpy")
@@ -139,18 +148,12 @@ def _passed(level: int, change: int, ticks: int) -> int:
 
 
 @njit(error_model="numpy")
-def _free(conflict: NDArray, t: int, u: int) -> bool:
-    """Return whether a state is out of conflict; after the last tick of the map all others rest."""
-    return not conflict[min(t, len(conflict) - 1), u]
-
-
-@njit(error_model="numpy")
 def _followed(how: NDArray, t: int, u: int, level: int) -> tuple[NDArray, NDArray]:
     """Return cells and rates at each tick up to an end, of the clock that waits as early as possible."""
     own, rate = np.zeros(t + 1, dtype=np.int64), np.zeros(t + 1)
     own[t], rate[t] = u, level / LEVELS
     while u > 0:
-        ways = how[t, u, level]
+        ways = how[t, level, u]
         if ways & _SAME and (level == LEVELS or not ways & _FASTER):
             t, u = t - 1, u - level
         else:
