@@ -101,12 +101,10 @@ class LabLoop:
         """Run until told to end, or until the parent process has ended."""
         parent, loops = os.getppid(), self.loops
         sources = [*(loop.link.fileno() for loop in loops), control.fileno()]
-        for loop in loops:
-            loop.serve()
+        self.serve()
         while os.getppid() == parent:
             readable = self._clock.readable(sources, min(loop.until_due() for loop in loops))
-            for loop in loops:
-                loop.serve()
+            self.serve()
             if control.fileno() in readable and not self._obey(control):
                 return
 
@@ -116,10 +114,16 @@ class LabLoop:
         return self, *self.companions.values()
 
     def serve(self) -> None:
-        """Do what is due by now, for the vehicle, the cameras and the sockets."""
+        """Do what is due by now, for all vehicles of the room, the cameras and the sockets."""
+        # One moment for all: the cameras have looked at all bodies by then, and see none where it will be later.
+        now = self._clock.now()
+        for loop in self.loops:
+            loop._serve_until(now)
+
+    def _serve_until(self, now: float) -> None:
         if math.isnan(self._origin):
-            self._origin = self._clock.now() - self.vehicle.tick / 1000
-        self._catch_up()
+            self._origin = now - self.vehicle.tick / 1000
+        self._catch_up(now)
         self._read_link()
 
     def until_due(self) -> float:
@@ -141,8 +145,7 @@ class LabLoop:
             return math.inf
         return max(self.vehicle.tick, math.ceil((self.cameras.next_look - self._origin) * 1000))
 
-    def _catch_up(self) -> None:
-        now = self._clock.now()
+    def _catch_up(self, now: float) -> None:
         if now - self._origin - self.vehicle.tick / 1000 > _LARGEST_LAG:
             self._origin = now - self.vehicle.tick / 1000
         self._run_to(int((now - self._origin) * 1000))

@@ -170,6 +170,35 @@ def test_a_vehicle_with_poses_on_board_knows_where_it_stands(stepped):
     assert loop.vehicle.firmware.stabilizer.loop.belief[:2].tolist() == pytest.approx([1.0, 2.0], abs=0.02)
 
 
+class StallingClock:
+    """A clock of a computer that stands still for 30 ms whenever it is read."""
+
+    def __init__(self):
+        self.time = 0.0
+
+    def now(self):
+        self.time += 0.03
+        return self.time
+
+
+def test_the_cameras_see_all_vehicles_at_one_moment_though_the_computer_stalls():
+    clock = StallingClock()
+    loop, other = (LabLoop(AIRFRAME, VehicleSettings(), clock=clock) for _ in range(2))
+    ticks = []
+
+    class Noting(Cameras):
+        def look(self, *seen):
+            ticks.append((loop.vehicle.tick, other.vehicle.tick))
+            super().look(*seen)
+
+    with loop.link, other.link:
+        loop.companions, loop.cameras = {"other": other}, Noting(ViconSettings(), 0.0)
+        for _ in range(10):
+            loop.serve()
+    assert len(ticks) > 20
+    assert all(first == second for first, second in ticks)
+
+
 def test_a_vehicle_that_stands_still_is_recorded_a_hundred_times_a_second(stepped):
     loop, clock = stepped()
     clock.sleep(1.0)
