@@ -10,6 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.errors import CfplanError
 from cfplan.geometry.path import Path
@@ -41,9 +42,10 @@ class Detours:
             return None
         names = [member.name for member in members]
         for name, other, blocking_place in zip(blocked.pair, blocked.pair[::-1], blocked.places[::-1], strict=True):
-            number, path = names.index(name), members[names.index(other)].plan.path
-            for x, y in (*path(np.array([0.0, path.end]))[:, :2].tolist(), blocking_place):
-                columns = (*self.columns.get(number, ()), self._column(other, x, y))
+            number = names.index(name)
+            own, others = _ends(members[number]), _ends(members[names.index(other)])
+            for place in (*others, np.array(blocking_place)):
+                columns = (*self.columns.get(number, ()), self._column(other, place, own))
                 with suppress(CfplanError):
                     if (member := self._replanned(number, members[number], columns)) is not None:
                         self.columns[number] = columns
@@ -59,9 +61,13 @@ class Detours:
             for column in columns
         ]
 
-    def _column(self, name: str, x: float, y: float) -> Cylinder:
-        space = self.limits.space
-        radius = max(self.fleet.apart + _SLACK - space.margin, _SLACK)  # the path keeps the margin from it
+    def _column(self, name: str, place: NDArray, own: NDArray) -> Cylinder:
+        """Return a column at a place, (2,) m, as wide as a vehicle's own start and end, (2, 2) m, leave room for."""
+        space, apart = self.limits.space, self.fleet.apart
+        room = float(np.linalg.norm(own - place, axis=1).min())
+        keeps = min(apart + _SLACK, max(room, apart))
+        x, y = place.tolist()
+        radius = max(keeps - space.margin, _SLACK)  # the path keeps the margin from it
         return Cylinder(x, y, radius, space.low[2], space.high[2], name)
 
     def _replanned(self, number: int, member: FleetMember, columns: tuple[Cylinder, ...]) -> FleetMember | None:
@@ -76,6 +82,12 @@ class Detours:
             return None
         plan = plan_flight(replace(detour, shape=None), limits, options).plan
         return replace(member, plan=plan if self.finish is None else self.finish(plan))
+
+
+def _ends(member: FleetMember) -> NDArray:
+    """Return x and y of a vehicle's start and end, (2, 2) m."""
+    path = member.plan.path
+    return np.asarray(path(np.array([0.0, path.end]))[:, :2])
 
 
 def _clears(path: Path, space: Space) -> bool:

@@ -7,16 +7,19 @@ from cfplan.errors import InfeasibleError
 from cfplan.preparation.plan_fleet import plan_fleet
 
 APART, SKEW = 0.35, 0.03
-ENDS = {"there": ([0.0, -1.6, 1.0], [0.0, 1.2, 1.0]), "back": ([0.0, 1.6, 1.0], [0.0, -1.2, 1.0])}
+BETWEEN_ENDS = {"there": ([0.0, -1.6, 1.0], [0.0, 1.2, 1.0]), "back": ([0.0, 1.6, 1.0], [0.0, -1.2, 1.0])}
+
+# Each begins 0.37 m before the other's start and flies over it.
+OVER_STARTS = {"there": ([0.0, 0.0, 1.0], [0.0, 1.6, 1.0]), "back": ([0.0, 0.37, 1.0], [0.0, -1.4, 1.0])}
 
 
 @pytest.fixture
 def face_to_face(tmp_path):
-    """Two vehicles that meet on one line; `shapes` are those of their paths."""
+    """Two vehicles that meet on one line; `shapes` are those of their paths, `all_ends` their starts and ends."""
 
-    def make(shapes):
+    def make(shapes, all_ends=BETWEEN_ENDS):
         lines = [f"apart: {APART}", f"skew: {SKEW}", "lost: warn", "vehicles:"]
-        for (name, ends), shape in zip(ENDS.items(), shapes, strict=True):
+        for (name, ends), shape in zip(all_ends.items(), shapes, strict=True):
             (tmp_path / f"{name}.yaml").write_text(f"waypoints: {list(ends)}\nshape: {shape}\n")
             lines.append(f"  {name}: {{path: {name}.yaml}}")
         file = tmp_path / "fleet.yaml"
@@ -26,10 +29,19 @@ def face_to_face(tmp_path):
     return make
 
 
-@pytest.mark.parametrize("shapes", [("fastest", "fastest"), ("min-snap", "fastest"), ("fastest", "min-snap")])
-def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, shapes):
+@pytest.mark.parametrize(
+    ("shapes", "all_ends"),
+    [
+        (("fastest", "fastest"), BETWEEN_ENDS),
+        (("min-snap", "fastest"), BETWEEN_ENDS),
+        (("fastest", "min-snap"), BETWEEN_ENDS),
+        (("fastest", "fastest"), OVER_STARTS),
+    ],
+    ids=["both", "one of min-snap", "other of min-snap", "over starts"],
+)
+def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, shapes, all_ends):
     steps = {}
-    fleet = plan_fleet(face_to_face(shapes), limits, on_step=lambda name, state, result: steps.update({name: result}))
+    fleet = plan_fleet(face_to_face(shapes, all_ends), limits, on_step=lambda name, state, result: steps.update({name: result}))
 
     times = np.arange(0.0, fleet.end + 0.5, 0.002)
 
@@ -44,7 +56,7 @@ def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, sh
     )
     assert nearest > APART - 1e-3
     for member in fleet.members:
-        assert np.allclose(member.plan.path(np.array([0.0, member.plan.path.end])), ENDS[member.name], atol=1e-6)
+        assert np.allclose(member.plan.path(np.array([0.0, member.plan.path.end])), all_ends[member.name], atol=1e-6)
         straight = np.abs(member.plan.path(np.linspace(0.0, member.plan.path.end, 200))[:, 0]).max() < 1e-6
         assert any(f"the path of {member.name} leads around" in each for each in fleet.detours) != straight
     assert fleet.detours
