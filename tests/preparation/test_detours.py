@@ -41,7 +41,9 @@ def face_to_face(tmp_path):
 )
 def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, shapes, all_ends):
     steps = {}
-    fleet = plan_fleet(face_to_face(shapes, all_ends), limits, on_step=lambda name, state, result: steps.update({name: result}))
+    fleet = plan_fleet(
+        face_to_face(shapes, all_ends), limits, on_step=lambda name, state, result: steps.update({name: result})
+    )
 
     times = np.arange(0.0, fleet.end + 0.5, 0.002)
 
