@@ -43,7 +43,7 @@ from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
 
 _FROM_MARGIN = 0.05  # m that waypoints keep from the margin of the walls, as paths swing out between them
-_WITHOUT_BUDGET = FlightOptions(budget=math.inf)  # or plans would depend on how busy the computer is
+_WITHOUT_BUDGET = FlightOptions(budget=math.inf)  # so that plans do not depend on the computer's load
 _LONGEST = 4.0  # s from the last setpoint until every vehicle lies on the floor
 
 

@@ -23,7 +23,7 @@ from cfplan.safety.limits import Limits
 from cfplan.safety.space import Cylinder, Space, distances_beyond, inside
 
 _MAX_COLUMNS = 4  # of a fleet
-_SLACK = 0.05  # m added to the distance to keep, so that start delays and clock rates are found
+_SLACK = 0.05  # m added to the distance to keep, at most, so that start delays and clock rates are found
 
 
 @dataclass(slots=True)
@@ -62,7 +62,11 @@ class Detours:
         ]
 
     def _column(self, name: str, place: NDArray, own: NDArray) -> Cylinder:
-        """Return a column at a place, (2,) m, as wide as a vehicle's own start and end, (2, 2) m, leave room for."""
+        """Return the column that a path must avoid at a place, (2,) m.
+
+        The path keeps `apart` plus slack from it; less slack, down to none, where an end of the replanned path, `own`,
+        (2, 2) m, is nearer.
+        """
         space, apart = self.limits.space, self.fleet.apart
         room = float(np.linalg.norm(own - place, axis=1).min())
         keeps = min(apart + _SLACK, max(room, apart))

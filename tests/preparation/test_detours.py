@@ -7,17 +7,17 @@ from cfplan.errors import InfeasibleError
 from cfplan.preparation.plan_fleet import plan_fleet
 
 APART, SKEW = 0.35, 0.03
-BETWEEN_ENDS = {"there": ([0.0, -1.6, 1.0], [0.0, 1.2, 1.0]), "back": ([0.0, 1.6, 1.0], [0.0, -1.2, 1.0])}
+ENDS_APART = {"there": ([0.0, -1.6, 1.0], [0.0, 1.2, 1.0]), "back": ([0.0, 1.6, 1.0], [0.0, -1.2, 1.0])}
 
-# Each begins 0.37 m before the other's start and flies over it.
-OVER_STARTS = {"there": ([0.0, 0.0, 1.0], [0.0, 1.6, 1.0]), "back": ([0.0, 0.37, 1.0], [0.0, -1.4, 1.0])}
+# Each straight path passes through the other's start, 0.37 m ahead: nearer than `apart` and the detours' slack, 0.40 m.
+STARTS_NEAR = {"there": ([0.0, 0.0, 1.0], [0.0, 1.6, 1.0]), "back": ([0.0, 0.37, 1.0], [0.0, -1.4, 1.0])}
 
 
 @pytest.fixture
 def face_to_face(tmp_path):
-    """Two vehicles that meet on one line; `shapes` are those of their paths, `all_ends` their starts and ends."""
+    """Two vehicles that meet on one line, with the shape of each path, and its start and end by name."""
 
-    def make(shapes, all_ends=BETWEEN_ENDS):
+    def make(shapes, all_ends=ENDS_APART):
         lines = [f"apart: {APART}", f"skew: {SKEW}", "lost: warn", "vehicles:"]
         for (name, ends), shape in zip(all_ends.items(), shapes, strict=True):
             (tmp_path / f"{name}.yaml").write_text(f"waypoints: {list(ends)}\nshape: {shape}\n")
@@ -32,12 +32,12 @@ def face_to_face(tmp_path):
 @pytest.mark.parametrize(
     ("shapes", "all_ends"),
     [
-        (("fastest", "fastest"), BETWEEN_ENDS),
-        (("min-snap", "fastest"), BETWEEN_ENDS),
-        (("fastest", "min-snap"), BETWEEN_ENDS),
-        (("fastest", "fastest"), OVER_STARTS),
+        (("fastest", "fastest"), ENDS_APART),
+        (("min-snap", "fastest"), ENDS_APART),
+        (("fastest", "min-snap"), ENDS_APART),
+        (("fastest", "fastest"), STARTS_NEAR),
     ],
-    ids=["both", "one of min-snap", "other of min-snap", "over starts"],
+    ids=["both fastest", "first min-snap", "second min-snap", "near starts"],
 )
 def test_vehicles_that_meet_on_one_line_pass_each_other(face_to_face, limits, shapes, all_ends):
     steps = {}

@@ -17,7 +17,7 @@ TICK = 0.04  # s of common time, a multiple of the setpoint period
 LEVELS = 4  # rates above 0
 CELL = TICK / LEVELS  # s of a plan's own time
 RAMP = 6  # ticks between rates: 1.04 /s, which from 2 m/s brakes at 2.1 m/s²
-# How a state was reached: from rest, at the same, a lower, or a higher rate.
+# How a state was reached: from rest, or from the same, a lower or a higher rate.
 _START, _SAME, _SLOWER, _FASTER = 1, 2, 4, 8
 
 
@@ -96,7 +96,7 @@ def _reached(conflict: NDArray, may_start: NDArray) -> tuple[NDArray, int, int, 
     end = cells - LEVELS  # the first cell at the end
     ticks = known + cells // LEVELS + LEVELS * RAMP
     how = np.zeros((ticks, LEVELS + 1, cells), dtype=np.uint8)
-    free = np.ones((ticks, cells), dtype=np.uint8)  # 1 where there is no conflict; after the last tick all others rest
+    free = np.ones((ticks, cells), dtype=np.uint8)  # 1 without conflict; after the map all others rest
     for t in range(ticks):
         for u in range(cells):
             free[t, u] = not conflict[min(t, known - 1), u]
@@ -123,12 +123,12 @@ def _reached(conflict: NDArray, may_start: NDArray) -> tuple[NDArray, int, int, 
 
 @njit(error_model="numpy")
 def _ramp(how: NDArray, free: NDArray, states: NDArray, t: int, level: int, change: int) -> None:
-    """Mark the states after a change of rate as reached, unless there is a conflict on the way or the end is passed.
+    """Mark the states reached by a change of rate without a conflict and without passing the end.
 
-    `states` are 1 for the cells before the end that are reached at the tick and the level.
+    `states`, (end,) uint8, is 1 for each cell that is reached at tick `t` and `level`.
     """
     passed = _passed(level, change, RAMP)
-    kept = states[: max(len(states) + 1 - passed, 0)]  # from these cells, the change ends at the end or before
+    kept = states[: max(len(states) + 1 - passed, 0)]  # cells from which the change finishes no later than the end
     for k in range(1, RAMP + 1):
         kept = kept & free[t + k, _passed(level, change, k) :][: len(kept)]
     _mark(how[t + RAMP, level + change, passed:], kept, _FASTER if change < 0 else _SLOWER)
@@ -136,7 +136,7 @@ def _ramp(how: NDArray, free: NDArray, states: NDArray, t: int, level: int, chan
 
 @njit(error_model="numpy")
 def _mark(how: NDArray, reached: NDArray, way: int) -> None:
-    """Mark the states that are reached in a way."""
+    """Add `way` to each state for which `reached` is 1."""
     for u in range(len(reached)):
         how[u] |= way * reached[u]
 

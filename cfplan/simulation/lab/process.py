@@ -114,8 +114,8 @@ class LabLoop:
         return self, *self.companions.values()
 
     def serve(self) -> None:
-        """Do what is due by now, for all vehicles of the room, the cameras and the sockets."""
-        # One moment for all: the cameras have looked at all bodies by then, and see none where it will be later.
+        """Advance all vehicles in the room to the present, and serve the cameras and sockets."""
+        # All advance to the same time: one that is farther would be ahead of the others when the cameras look next.
         now = self._clock.now()
         for loop in self.loops:
             loop._serve_until(now)
@@ -127,7 +127,7 @@ class LabLoop:
         self._read_link()
 
     def until_due(self) -> float:
-        """Return s until `serve` is needed again, unless a packet comes sooner."""
+        """Return s until this loop must be served again, unless a packet comes sooner."""
         return max(0.0, self._due() - self._clock.now())
 
     def _due(self) -> float:

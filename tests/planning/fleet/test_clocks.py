@@ -1,4 +1,4 @@
-"""The fastest clock, against a search that marks one state after another."""
+"""The fastest clock ends when a plain search from state to state says it can, and keeps out of hazards."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -6,12 +6,12 @@ from hypothesis import strategies as st
 
 from cfplan.planning.fleet.clocks import CELL, LEVELS, RAMP, TICK, Stuck, cells_of, fastest_clock
 
-ANYWHERE = np.zeros((0, 1, 1, 2))  # columns of no other vehicles
+NO_OTHERS = np.zeros((0, 1, 1, 2))  # (K, T, W, 2) m for K = 0 other vehicles
 
 
 @st.composite
 def maps(draw):
-    """The cells of a plan, and a map of hazards of some rectangles with the ticks at which the vehicle may start."""
+    """Draw a hazard map of up to five rectangles, (T, U), and the ticks at which the vehicle may start, (T,)."""
     cells = len(cells_of(draw(st.floats(0.05, 1.2))))
     ticks = draw(st.integers(2, 50))
     hazard = np.zeros((ticks, cells), dtype=np.bool_)
@@ -23,12 +23,12 @@ def maps(draw):
 
 
 def changes(level, change):
-    """The cells passed at each tick of a change of rate, which is linear in time; halves are rounded up."""
+    """Return the cells passed by each tick of a linear change of rate, halves rounded up."""
     return [int(np.floor(level * k + change * k * k / (2 * RAMP) + 0.5)) for k in range(1, RAMP + 1)]
 
 
 def earliest_end(hazard, may_start):
-    """The first tick at which a vehicle may rest at its end, by following each clock from state to state; or None."""
+    """Return the first tick at which the vehicle can rest at its end, following each clock; None if there is none."""
     known, cells = hazard.shape
     end, longest = cells - LEVELS, known + cells + LEVELS * RAMP
 
@@ -40,11 +40,11 @@ def earliest_end(hazard, may_start):
         if may_start[min(t, known - 1)]:
             starts += [(t, 0, level) for level in range(1, LEVELS + 1)]
         t += 1
-    seen, following, ends = set(starts), starts, []
-    while following:
-        t, u, level = following.pop()
+    seen, pending, ends = set(starts), starts, []
+    while pending:
+        t, u, level = pending.pop()
         if u >= end:
-            if all(free(later, end) for later in range(t, known + 1)):
+            if all(free(later, end) for later in range(t, max(t, known) + 1)):
                 ends.append(t)
             continue
         ways = [(1, u + level, level)] if free(t + 1, u + level) else []
@@ -60,16 +60,16 @@ def earliest_end(hazard, may_start):
             state = (t + ticks, cell, new)
             if state not in seen and state[0] <= longest:
                 seen.add(state)
-                following.append(state)
+                pending.append(state)
     return min(ends, default=None)
 
 
-@settings(max_examples=40)  # it takes its time
+@settings(max_examples=40)  # the plain search is slow
 @given(maps())
 def test_no_clock_ends_earlier_and_none_is_missed(drawn):
     hazard, may_start = drawn
     expected = earliest_end(hazard, may_start)
-    clock = fastest_clock(np.zeros((hazard.shape[1], 2)), ANYWHERE, 0.3, hazard, may_start)
+    clock = fastest_clock(np.zeros((hazard.shape[1], 2)), NO_OTHERS, 0.3, hazard, may_start)
     if isinstance(clock, Stuck):
         assert expected is None
     else:
@@ -79,7 +79,7 @@ def test_no_clock_ends_earlier_and_none_is_missed(drawn):
 @given(maps())
 def test_a_clock_keeps_out_of_the_hazards_and_its_rate_is_its_slope(drawn):
     hazard, may_start = drawn
-    clock = fastest_clock(np.zeros((hazard.shape[1], 2)), ANYWHERE, 0.3, hazard, may_start)
+    clock = fastest_clock(np.zeros((hazard.shape[1], 2)), NO_OTHERS, 0.3, hazard, may_start)
     if isinstance(clock, Stuck):
         return
     ticks = np.arange(len(clock.own))
@@ -90,4 +90,4 @@ def test_a_clock_keeps_out_of_the_hazards_and_its_rate_is_its_slope(drawn):
     assert may_start[min(begins, len(may_start) - 1)]
     mean_rate = (clock.rate[begins + 1 :] + clock.rate[begins:-1]) / 2
     passed = np.cumsum(mean_rate) * TICK / CELL
-    assert np.abs(clock.own[begins + 1 :] - passed).max() <= 0.5 + 1e-9  # cells are whole
+    assert np.abs(clock.own[begins + 1 :] - passed).max() <= 0.5 + 1e-9  # cells are integers

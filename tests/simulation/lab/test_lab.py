@@ -171,7 +171,7 @@ def test_a_vehicle_with_poses_on_board_knows_where_it_stands(stepped):
 
 
 class StallingClock:
-    """A clock of a computer that stands still for 30 ms whenever it is read."""
+    """The clock of a computer that stalls for 30 ms before every reading."""
 
     def __init__(self):
         self.time = 0.0
@@ -181,18 +181,18 @@ class StallingClock:
         return self.time
 
 
-def test_the_cameras_see_all_vehicles_at_one_moment_though_the_computer_stalls():
+def test_the_cameras_see_all_vehicles_at_one_moment_even_if_the_computer_stalls():
     clock = StallingClock()
     loop, other = (LabLoop(AIRFRAME, VehicleSettings(), clock=clock) for _ in range(2))
     ticks = []
 
-    class Noting(Cameras):
+    class RecordingCameras(Cameras):
         def look(self, *seen):
             ticks.append((loop.vehicle.tick, other.vehicle.tick))
             super().look(*seen)
 
     with loop.link, other.link:
-        loop.companions, loop.cameras = {"other": other}, Noting(ViconSettings(), 0.0)
+        loop.companions, loop.cameras = {"other": other}, RecordingCameras(ViconSettings(), 0.0)
         for _ in range(10):
             loop.serve()
     assert len(ticks) > 20
