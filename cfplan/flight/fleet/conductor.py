@@ -47,6 +47,7 @@ OFF_BY_MORE = 0.05  # m beyond the deviation that `apart` allows: all brake if a
 """With another vehicle off by what is allowed, 0.15 m are left, and vehicles touch at 0.14 m."""
 STANDS_NEARER = 0.02  # m by which vehicles may stand nearer than they fly: error of the poses
 PILOT_SILENT = 0.5  # s without a message of the tick loop of a pilot whose vehicle has passed preflight
+PREFLIGHT_SILENT = 60.0  # s without one before that; a lossy radio takes half of it to read the vehicle's tables
 START_LEAD = 1.2  # s from the last vehicle's readiness to the start of all, for the message to arrive
 """Longer than CONDUCTOR_SILENT: a pilot that hears of its start too late has braked before."""
 FOR_ORDERS = 0.01  # s, largest difference between the arrivals of an order to brake at two pilots
@@ -245,11 +246,12 @@ class Conductor:
     # What ends the flight of all.
 
     def _watch(self, now: float) -> None:
-        flying = [vehicle for vehicle in self._vehicles.values() if Phase.ARM in vehicle.asked and not vehicle.ended]
-        for vehicle in flying:
-            if not vehicle.down and now - vehicle.heard > PILOT_SILENT:
-                self._brake(f"{vehicle.name}: neither setpoints nor poses came from its pilot for {PILOT_SILENT:g} s")
-        for a, b in itertools.combinations(flying, 2):
+        begun = [vehicle for vehicle in self._vehicles.values() if vehicle.heard > -math.inf and not vehicle.ended]
+        for vehicle in begun:
+            allowed = PILOT_SILENT if Phase.ARM in vehicle.asked else PREFLIGHT_SILENT
+            if not vehicle.down and now - vehicle.heard > allowed:
+                self._brake(f"{vehicle.name}: neither setpoints nor poses came from its pilot for {allowed:g} s")
+        for a, b in itertools.combinations([each for each in begun if Phase.ARM in each.asked], 2):
             self._watch_pair(a, b, now)
 
     def _watch_pair(self, a: _Vehicle, b: _Vehicle, now: float) -> None:

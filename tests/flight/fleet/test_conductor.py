@@ -9,6 +9,7 @@ from cfplan.errors import ExitCode
 from cfplan.flight.fleet.conductor import (
     OBEYS_LATE,
     PILOT_SILENT,
+    PREFLIGHT_SILENT,
     START_LEAD,
     ConductedFlight,
     Conductor,
@@ -302,6 +303,18 @@ def test_all_brake_when_a_pilot_is_silent():
     assert not braking(fleet.go_on(PILOT_SILENT - 0.05))
     assert braking(fleet.go_on(0.1)) == {"left", "right"}
     assert "right" in fleet.conductor.brakes
+
+
+def test_no_pilot_waits_forever_for_one_that_fell_silent_in_preflight():
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    fleet.ask(Phase.ARM, "left")
+    fleet.silent.add("right")
+    assert not braking(fleet.go_on(PREFLIGHT_SILENT - 0.1))
+    said = fleet.go_on(0.2)
+    assert braking(said) == {"left", "right"}
+    assert "right: neither setpoints nor poses came from its pilot" in said["left"].brakes
+    assert not cleared(said, Phase.ARM)
 
 
 def test_all_brake_when_a_tick_loop_hangs_while_the_radio_of_that_pilot_goes_on():
