@@ -128,7 +128,7 @@ def _ramp(how: NDArray, free: NDArray, states: NDArray, t: int, level: int, chan
     `states`, (end,) uint8, is 1 for each cell that is reached at tick `t` and `level`.
     """
     passed = _passed(level, change, RAMP)
-    kept = states[: max(len(states) + 1 - passed, 0)]  # cells from which the change finishes no later than the end
+    kept = states[: max(len(states) + 1 - passed, 0)]  # cells from which the change is complete by the end
     for k in range(1, RAMP + 1):
         kept = kept & free[t + k, _passed(level, change, k) :][: len(kept)]
     _mark(how[t + RAMP, level + change, passed:], kept, _FASTER if change < 0 else _SLOWER)
