@@ -1,13 +1,14 @@
 """Repeat flights of the paper's tables with the bodies of RotorPy, at two motor lags, and of drone-models.
 
-The paper flies in RotorPy. This study flies a sample of each kind of table in RotorPy too, and in drone-models where it
-knows the vehicle. The controller is the same as in the table: the geometric one, or the firmware's with the same
-packets.
+The paper flies in RotorPy. This study flies Tables 1 to 3 in RotorPy with the motor lag that it had then, and a sample
+of each kind of table with RotorPy's present lag too, and in drone-models where it knows the vehicle. The controller is
+the same as in the table: the geometric one, or the firmware's with the same packets.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -19,27 +20,28 @@ from cfplan.geometry.path import Path
 from cfplan.learning.learned import plan_learned
 from cfplan.planners.baselines.toppquad import plan_toppquad
 from cfplan.planners.expert.expert import plan_expert
-from cfplan.planning.repair import refine, repair
+from cfplan.planning.repair import refine
 from cfplan.safety.limit_sets import PAPER
 from cfplan.safety.limits import Limits
 from cfplan.safety.limits_file import DEFAULTS, load_limits
 from cfplan.simulation.geometric_flight import LOST, positions_by_both
 from cfplan.vehicle.airframe import Airframe
-from cfplan.vehicle.profile import SpeedProfile
 from cfplan.vehicle.trajectory import Trajectory
 from studies.paper.architectures import SHIPPED_LIMITS, amid, shipped_task
 from studies.paper.hardware import CERTIFIED, RAW, TRACKED, encoded_plan, hardware_paths, paper_limits
 from studies.paper.printed import TEST
 from studies.paper.trained import NetworkSettings, TrainedNetwork, paper_data
-from studies.paper.training import SequenceOptions
+from studies.paper.training import OURS, SequenceOptions
 from studies.paper.trials import (
     DEVIATION,
+    DEVIATION_P90,
     EXPERT,
     FAILED,
+    PAPER_LAG,
     TOPPQUAD,
+    Plan,
     flown,
     network_plan,
-    paper_task,
     profile_by,
     profile_of,
     shipped_profile,
@@ -52,18 +54,20 @@ from studies.runner.study import Run, Study, Work
 
 PLANNED, SHIPPED, HARDWARE = "Tables 1 to 3", "Table 1, the planner that ships", "hardware"
 SHIPPED_PLANNER = "the shipped planner"
-NETWORK, CERTIFIED_NETWORK = "LSTM", "LSTM, certified"
-ROWS = (
-    (PLANNED, TOPPQUAD), (PLANNED, EXPERT), (PLANNED, NETWORK), (PLANNED, CERTIFIED_NETWORK),
-    (PLANNED, SHIPPED_PLANNER), (SHIPPED, SHIPPED_PLANNER), (HARDWARE, TOPPQUAD), (HARDWARE, SHIPPED_PLANNER),
-)  # fmt: skip
+NETWORKS = (SequenceOptions(), OURS)
+PLANNERS = {
+    PLANNED: (TOPPQUAD, EXPERT, *(each.name for each in NETWORKS), SHIPPED_PLANNER),
+    SHIPPED: (SHIPPED_PLANNER,),
+    HARDWARE: (TOPPQUAD, SHIPPED_PLANNER),
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Settings(NetworkSettings):
     """The paths to fly."""
 
-    paths: int = option(8, "Paths of each kind of table.", least=1)
+    paths: int = option(100, "Paths of Tables 1 to 3, flown in RotorPy with the paper's motor lag.", least=1)
+    others: int = option(6, "Paths of each other table, and of Tables 1 to 3 with the other bodies.", least=1)
 
 
 class Asked(NamedTuple):
@@ -73,6 +77,7 @@ class Asked(NamedTuple):
     planner: str
     name: str
     path: Path
+    all_bodies: bool = True  # or RotorPy with the paper's motor lag alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +110,7 @@ COLUMNS = (
     Column("body", "body"),
     Column("paths", value=count()),
     DEVIATION,
+    DEVIATION_P90,
     Column("own_deviation", "cfplan's body", "m", ".3f", meaning="the same, with the same motor lag",
            value=mean(lambda flight: LOST if flight.own_failed else flight.own_deviation)),
     FAILED,
@@ -116,31 +122,33 @@ COLUMNS = (
 
 
 def work(settings: Settings, run: Run) -> Work:
-    """Return one case per path and entry of ROWS; the LSTM is trained if necessary.
+    """Return one case per path and planner of each table; the networks are trained if necessary.
 
     Raises:
         InputError: neither RotorPy nor drone-models is installed; also as `paper_data`.
     """
     usual = _room_limits()
     bodies_for(usual.airframe)
-    data = paper_data(settings, run, [SequenceOptions()])
+    data = paper_data(settings, run, NETWORKS)
     tested = {str(each.row): each.path for each in data.part(TEST).values()}
-    room = hardware_paths(usual, len(tested))
+    few = dict(islice(tested.items(), settings.others))
+    room = hardware_paths(usual, settings.others)
     cases = {
-        f"{kind}, {planner}, {name}": Asked(kind, planner, name, path)
-        for kind, planner in ROWS
-        for name, path in (room if kind == HARDWARE else tested).items()
+        f"{kind}, {planner}, {name}": Asked(kind, planner, name, path, kind != PLANNED or name in few)
+        for kind, names in PLANNERS.items()
+        for planner in names
+        for name, path in {PLANNED: tested, SHIPPED: few, HARDWARE: room}[kind].items()
     }
-    return Work(cases, partial(measure, data.networks[0]), BodyFlight, data.identity)
+    return Work(cases, partial(measure, {each.name: each for each in data.networks}), BodyFlight, data.identity)
 
 
-def measure(network: TrainedNetwork, asked: Asked) -> list[BodyFlight]:
+def measure(networks: Mapping[str, TrainedNetwork], asked: Asked) -> list[BodyFlight]:
     """Plan a path, and fly it with each body."""
-    bodies = bodies_for(_airframe(asked.table))
+    bodies = [body for body in bodies_for(_airframe(asked.table)) if asked.all_bodies or body.motor_lag == PAPER_LAG]
     begun = [BodyFlight(asked.table, asked.planner, asked.name, body.name) for body in bodies]
     try:
         if asked.table == PLANNED:
-            fly = partial(_by_geometric_controller, _planned(network, asked.planner, asked.path))
+            fly = partial(_by_geometric_controller, _planned(networks, asked.planner, asked.path))
         else:
             fly = partial(_by_bytes, *_sent(asked))
         return [fly(flight, body) for flight, body in zip(begun, bodies, strict=True)]
@@ -189,14 +197,12 @@ def _by_bytes(encoded: EncodedFlight, trajectory: Trajectory, begun: BodyFlight,
     return replace(begun, deviation=found.deviation, own_deviation=found.own_deviation, apart=found.apart)
 
 
-def _planned(network: TrainedNetwork, planner: str, path: Path) -> Trajectory:
-    plan = network_plan(network)
-    profiles: dict[str, Callable[[Path], SpeedProfile]] = {
-        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), NETWORK: plan,
-        CERTIFIED_NETWORK: lambda path: repair(paper_task(path), plan(path)).trajectory.profile,
-        SHIPPED_PLANNER: shipped_profile,
+def _planned(networks: Mapping[str, TrainedNetwork], planner: str, path: Path) -> Trajectory:
+    plans: dict[str, Plan] = {name: network_plan(each) for name, each in networks.items()}
+    plans |= {
+        TOPPQUAD: profile_by(plan_toppquad), EXPERT: profile_by(plan_expert), SHIPPED_PLANNER: shipped_profile,
     }  # fmt: skip
-    return Trajectory(path, profiles[planner](path), PAPER.airframe)
+    return Trajectory(path, plans[planner](path), PAPER.airframe)
 
 
 def _sent(asked: Asked) -> tuple[EncodedFlight, Trajectory]:
@@ -215,4 +221,4 @@ def tables(settings: Settings, rows: list[BodyFlight]) -> Iterator[Table]:
     yield table("simulators", title, COLUMNS, rows, by=("table", "planner", "body"))
 
 
-STUDY = Study(Settings, work, tables, "--paths 3 -o results/simulators.json")
+STUDY = Study(Settings, work, tables, "--paths 3 --others 1 -o results/simulators.json")

@@ -20,7 +20,7 @@ from studies.paper.simulators import (
     measure,
     tables,
 )
-from studies.paper.trials import FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
+from studies.paper.trials import EXPERT, FLOWN, PAPER_LAG, TOPPQUAD, profile_by, trajectory_by
 
 LAGS = [f"RotorPy, {lag:g} s" for lag in (0.072, 0.005)]
 
@@ -51,11 +51,19 @@ def test_rotorpy_with_the_papers_motor_lag_follows_as_cfplan_does(trajectory):
 def test_bytes_of_the_planner_that_ships_are_followed_by_every_body():
     pytest.importorskip("rotorpy")
     path = min_snap([[0, 0, 1], [1.5, 0.8, 1.6], [2.9, 0.0, 1.1]])
-    flights = measure(None, Asked(SHIPPED, SHIPPED_PLANNER, "1", path))
+    flights = measure({}, Asked(SHIPPED, SHIPPED_PLANNER, "1", path))
     assert {flight.body for flight in flights} >= set(LAGS)
     assert all(not flight.reason and flight.both_flown for flight in flights)
     assert max(flight.own_deviation for flight in flights) < 0.1
     assert all(0.0 < flight.apart < 0.2 for flight in flights)
+
+
+def test_beyond_the_sample_tables_1_to_3_are_flown_with_the_papers_lag_alone():
+    pytest.importorskip("rotorpy")
+    path = min_snap([[0, 0, 1], [0.5, 0.3, 1.2], [0.9, 0.0, 1.1]])
+    (flight,) = measure({}, Asked(PLANNED, EXPERT, "7", path, all_bodies=False))
+    assert flight.body == LAGS[1]
+    assert flight.both_flown
 
 
 def test_the_lost_count_as_a_metre_and_are_left_out_of_how_far_bodies_are_apart():
