@@ -43,7 +43,7 @@ test-processors: $(PROCESSORS:%=test-as-%)
 # Without the tests of the planner's process: they go by the computer's clock, and slower code answers late.
 test-as-%: $(VENV)/installed-tests
 	$(BIN)/python -m tests.processors $* $(BIN)/cfplan doctor --warm-up
-	$(BIN)/python -m tests.processors $* $(PYTEST) --ignore tests/preparation/test_planner_process.py
+	$(BIN)/python -m tests.processors $* $(PYTEST) --ignore tests/air/test_process.py
 
 slow: slow-stepped
 	$(BIN)/python -m pytest -m slow -k in_real_time

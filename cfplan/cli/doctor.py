@@ -103,7 +103,11 @@ def _priority() -> dict[str, str]:
 
     if may_use_fifo_scheduling():
         return _check("priority", f"SCHED_FIFO, {STREAM_PRIORITY}")
-    hint = f"setpoints wait for other programs; `rtprio {STREAM_PRIORITY}` in /etc/security/limits.d permits more"
+    line = f"$USER - rtprio {STREAM_PRIORITY}"
+    hint = (
+        "setpoints wait for other programs; permit real-time scheduling, and log in anew: "
+        f'`echo "{line}" | sudo tee /etc/security/limits.d/99-cfplan.conf`'
+    )
     return _check("priority", "ordinary", "optional", hint)
 
 

@@ -133,13 +133,15 @@ def planning(command: Callable) -> Callable:
 
 
 def find_safety_file(given: Path | None, path_file: Path) -> Path:
-    """Return the safety.yaml to use: the one given, or the nearest above the working folder or above the path file.
+    """Return the safety.yaml to use: the one given, or the nearest in or above the working folder or the path file.
 
-    Raises InputError if there is none.
+    The path file's counts first if it lies within the working folder, else that of the working folder. Raises
+    InputError if there is none.
     """
     if given is not None:
         return given
-    found = nearest(SAFETY_FILE, Path.cwd(), path_file.resolve().parent)
+    working, beside = Path.cwd(), path_file.resolve().parent
+    found = nearest(SAFETY_FILE, *((beside, working) if beside.is_relative_to(working) else (working, beside)))
     if found is not None:
         return found
     raise InputError(

@@ -1,5 +1,7 @@
 """`cfplan init`: what it writes can be flown in that room, and what was there stays."""
 
+from pathlib import Path
+
 import pytest
 
 from cfplan.geometry.path_file import load_path_file
@@ -33,6 +35,16 @@ def test_a_weighed_vehicle_gets_an_airframe_file_of_its_own(cfplan, tmp_path):
     airframe = load_limits(tmp_path / "safety.yaml").airframe
     assert airframe.mass == 0.0334
     assert "33.4 g" in airframe.name
+
+
+def test_its_room_counts_for_its_path_also_from_a_folder_with_another_room(cfplan, tmp_path, monkeypatch):
+    cfplan("init", tmp_path)
+    cfplan("init", tmp_path / "lab", "--room", "2x2x2")
+    monkeypatch.chdir(tmp_path)
+    words = "plan", "--planner", "convex"
+    assert str(Path("lab", "safety.yaml")) in cfplan(*words, "lab/first.yaml").out
+    monkeypatch.chdir(tmp_path / "lab")
+    assert "lab" not in cfplan(*words, "../first.yaml").out.splitlines()[0].replace(str(tmp_path), "")
 
 
 @pytest.mark.parametrize("there", ["safety.yaml", "first.yaml", "airframe.yaml"])

@@ -9,7 +9,7 @@ import yaml
 from cfplan.safety.limits_file import DEFAULTS, Key, all_keys
 
 PAGE = (Path(__file__).parents[2] / "docs" / "safety.md").read_text()
-COLUMNS = ["key", "unit", "default", "may be", "what it is, and why", "at it"]
+COLUMNS = ["key", "unit", "default", "allowed", "meaning and reason", "effect"]
 ROWS = {
     cells[0].strip("`"): dict(zip(COLUMNS, cells, strict=True))
     for line in PAGE.splitlines()
@@ -51,14 +51,14 @@ def test_the_page_has_every_key_in_the_order_of_the_file():
 @pytest.mark.parametrize("key", KEYS.values(), ids=lambda key: key.name)
 def test_a_row_says_what_the_reader_knows(key: Key):
     row = ROWS[key.name]
-    assert row["may be"] == key.range
+    assert row["allowed"] == key.range
     if key.name in NEEDED:
         assert key.default is None
         assert row["default"] == "needed"
     else:
         assert yaml.safe_load(row["default"]) == key.default
-    assert row["what it is, and why"].endswith(".")
-    assert row["at it"].endswith(".")
+    assert row["meaning and reason"].endswith(".")
+    assert row["effect"].endswith(".")
 
 
 @pytest.mark.parametrize("name", [name for name in KEYS if name not in ("vehicle", "space.high")])
