@@ -6,15 +6,17 @@ lost vehicles
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.errors import InfeasibleError, NotCertifiedError
 from cfplan.flight.firmware import estimate_errors
 from cfplan.flight.setpoints.encoding import RATE
+from cfplan.flight.setpoints.packets import decode, encode
 from cfplan.flight.setpoints.stops import stop_clock
 from cfplan.planning.fleet.coordination import Blocked, Finish, coordinate
 from cfplan.planning.fleet.fleet_file import FleetFile, load_fleet_file
@@ -331,12 +333,30 @@ def loss_model(fleet: FleetFile, limits: Limits) -> LossModel:
     def tube(plan: Plan) -> Tube:
         payloads = encode_flight(PlannedFlight("", plan, limits)).payloads
         boxes = link_loss_tubes(payloads, limits, np.arange(len(payloads)))
+        boxes = _with_hover_after_take_off(boxes, payloads, limits)
         boxes[..., 0, :2] -= deviation
         boxes[..., 1, :2] += deviation
         return Tube(boxes, RATE, 0.001 * TUBE_PART)
 
     stop = stop_clock(RATE)[0] / RATE
     return LossModel(once_per_plan(tube), stop, tuple(fleet.dongles.values()), lost_clearance(fleet.apart))
+
+
+def _with_hover_after_take_off(boxes: NDArray, payloads: NDArray, limits: Limits) -> NDArray:
+    """Return tubes, (K, R, S, 2, 3) m, whose first row also encloses a loss in the hover after take-off."""
+    start, height = decode(payloads[:1]), limits.ground.take_off_height
+    if start.position[0, 2] >= height:
+        return boxes
+    above = replace(start, position=np.append(start.position[:, :2], [[height]], axis=1))
+    higher = link_loss_tubes(encode(above), limits, np.arange(1))
+    parts = max(boxes.shape[2], higher.shape[2])
+    boxes, higher = (
+        np.pad(each, ((0, 0), (0, 0), (0, parts - each.shape[2]), (0, 0), (0, 0)), mode="edge")
+        for each in (boxes, higher)
+    )
+    boxes[:, 0, :, 0] = np.minimum(boxes[:, 0, :, 0], higher[:, 0, :, 0])
+    boxes[:, 0, :, 1] = np.maximum(boxes[:, 0, :, 1], higher[:, 0, :, 1])
+    return boxes
 
 
 def once_per_plan(make: Callable[[Plan], T]) -> Callable[[Plan], T]:

@@ -163,10 +163,11 @@ def _same_vehicle(a: str, b: str) -> bool:
 
 def _vehicle(uri: str) -> tuple[str, ...]:
     """Return what identifies a vehicle, with cflib's defaults for what a URI leaves out."""
-    kind, _, rest = uri.partition("?")[0].partition("://")
+    kind, _, rest = uri.partition("://")
     if kind == "sim":
         return kind, str(int(rest))
     if kind != "radio":
         return kind, rest
-    _, channel, rate, address, *_ = [*rest.split("/"), "", "", ""]
+    of_vehicle = rest.partition("/")[2].partition("?")[0]  # as check_vehicle_uri() reads it
+    channel, rate, address, *_ = [*of_vehicle.split("/"), "", ""]
     return kind, str(int(channel)), rate or "2M", address.upper() or "E7E7E7E7E7"

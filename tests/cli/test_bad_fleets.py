@@ -52,6 +52,7 @@ def fly(cfplan, safety_file, tmp_path, monkeypatch):
         ("uri: 'sim://01'", "uri: 'sim://1'", [], 2, "a and b have the same address"),
         (radio(0, "0a"), radio(1, "0A"), MOCAP, 2, "a and b have the same address"),
         (radio(0, "E7"), "uri: 'radio://1/80'", MOCAP, 2, "a and b have the same address"),
+        (radio("0?safelink=0", "01"), radio(1, "01"), MOCAP, 2, "a and b have the same address"),
         ("body: b", "", [], 2, "a and b have the same body"),
         ("body: one", "body: one", [], 2, "a and b have the same body"),
         ("place: {y: 0.8}", "", [], 2, "start 0.20 m from each other"),
@@ -60,6 +61,7 @@ def fly(cfplan, safety_file, tmp_path, monkeypatch):
         (radio(0, "01"), "uri: 'radio://0/110/2M/E7E7E7E702'", MOCAP, 2, "does not transmit on channel 110"),
         (radio(0, "01"), "uri: 'radio://0/80/250K/E7E7E7E702'", MOCAP, 2, "does not transmit on channel 80 at 250K"),
         (radio("E7E7E7E7E7", "01"), radio("E7E7E7E7E7", "02"), MOCAP, 2, "named by its serial number"),
+        (radio("e7aabbccdd", "01"), radio("E7AABBCCDD", "02"), MOCAP, 2, "named by its serial number"),
         (radio("1234567890", "01"), radio("1234567890", "02"), MOCAP, 2, "named by its serial number"),
         ("uri: 'radio://0/80/2M/1'", radio(1, "01"), MOCAP, 2, "not an address"),
         ("uri: 'radio://0/200'", radio(1, "01"), MOCAP, 2, "not a channel"),
@@ -88,7 +90,7 @@ def test_a_dozen_vehicles_on_one_dongle_are_too_many(fly):
 def test_a_dongle_that_five_vehicles_share_is_refused_with_need_capacity_and_cure(fly):
     ended = fly(radio(0, "01"), radio(0, "02"), MOCAP, *(radio(0, f"{n:02}") for n in range(3, 6)))
     assert ended.code == 2
-    for part in ("a and b", "need 1050 packets a second of dongle 0", "carries 975", "more dongles"):
+    for part in ("a and b", "need 1100 packets a second of dongle 0", "carries 975", "more dongles"):
         assert part in " ".join(ended.err.split())
 
 
@@ -100,7 +102,7 @@ def test_a_crazyradio_without_inline_mode_serves_one_vehicle(fly, monkeypatch, f
     monkeypatch.setattr("cfplan.steering.connected_fleet.plan_fleet", Mock(side_effect=LinkError("it would fly")))
     ended = fly(radio(0, "01"), radio(0, "02"), MOCAP)
     assert ended.code == code
-    parts = ("need 420", "carries 225", "firmware 5.1") if code == 2 else ("it would fly",)
+    parts = ("need 440", "carries 225", "firmware 5.1") if code == 2 else ("it would fly",)
     for part in parts:
         assert part in " ".join(ended.err.split())
 

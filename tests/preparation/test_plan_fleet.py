@@ -100,6 +100,20 @@ def test_a_tube_contains_vehicles_that_are_as_far_off_their_path_as_allowed_when
         assert (way[:, 1] >= y + off).all()
 
 
+def test_the_tube_of_a_vehicle_that_waits_contains_a_fall_from_the_hover_after_take_off(limits):
+    low = plan(min_snap([[-0.6, 0.0, 0.3], [0.6, 0.0, 0.3]]), limits.airframe, limits)
+    tubes = {}
+    for height in (0.3, 1.5):
+        high = replace(limits, ground=replace(limits.ground, take_off_height=height))
+        tubes[height] = loss_model(FleetFile("row", (), 0.33, SKEW), high).tube(low).boxes
+    first, last = tubes[0.3][:, 0], tubes[1.5][:, 0]
+    assert (last[:, : first.shape[1], 0] <= first[:, :, 0] + 1e-9).all()
+    assert (last[:, : first.shape[1], 1] >= first[:, :, 1] - 1e-9).all()
+    assert last[..., 0, 1].min() < first[..., 0, 1].min() - 0.03
+    parts = tubes[0.3].shape[2]
+    np.testing.assert_array_equal(tubes[1.5][:, 1:, :parts], tubes[0.3][:, 1:])
+
+
 def test_a_vehicle_that_hovers_until_all_have_taken_off_must_not_fly_longer_than_its_battery_lasts(line, limits):
     ground, height = limits.ground, limits.space.high[2] - limits.space.low[2]
     alone = line.trajectory.duration + height / ground.take_off_speed + height / ground.land_speed

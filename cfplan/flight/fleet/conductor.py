@@ -101,6 +101,7 @@ class _Vehicle:
     late: float = -math.inf  # s from the time at which its plan was to begin until it began; -inf before that
     phase: Phase | None = None  # the last that it has entered
     stood: Triple | None = None  # m, when it passed preflight
+    risen: bool = False  # it has taken off, by its poses; its start may be lower
     descending: bool = False
     down: bool = False  # its motors are off
     left: bool = False  # its plan, for whatever reason
@@ -111,7 +112,7 @@ class _Vehicle:
         return self.flight.name
 
     @property
-    def risen(self) -> bool:
+    def is_high(self) -> bool:
         return self.stood is not None and self.poses[-1].position[2] - self.stood[2] > RISEN
 
     def place(self, time: float) -> Triple:
@@ -120,15 +121,16 @@ class _Vehicle:
 
     @property
     def deviation(self) -> float:
-        """Return how far, m, it was beside its place when it was seen last; 0 on its way up and down.
+        """Return how far, m, it was from its place when it was seen last; 0 on its way up and down.
 
-        Its place is its start until its plan begins, then on its path, and at last where it hovers at the end.
+        Its place is its start until its plan begins, then on its path, and at last where it hovers at the end. Height
+        counts: a vehicle that is too low would stop from an earlier setpoint than the others.
         """
         if self.descending or Phase.STREAM not in self.asked:
             return 0.0
         pose = self.poses[-1]
         place = _between(self.setpoints, pose.time - LEAD) if self.setpoints else self.flight.start
-        return math.dist(pose.position[:2], place[:2])
+        return math.dist(pose.position, place)
 
 
 def _between(seen: Sequence[PoseReceived | SetpointSent], time: float) -> Triple:
@@ -178,6 +180,10 @@ class Conductor:
         poses = self._vehicles[name].poses
         return poses[-1].position if poses else None
 
+    def heard(self, name: str) -> float:
+        """Return when a pilot's tick loop was heard last, s; -inf before that."""
+        return self._vehicles[name].heard
+
     def hear(self, name: str, message: PilotMessage | FlightEnded | Telemetry, now: float) -> None:
         """Take what a vehicle's pilot says at a time, s."""
         vehicle = self._vehicles[name]
@@ -186,9 +192,10 @@ class Conductor:
         match message:
             case PoseReceived():
                 vehicle.poses.append(message)
+                vehicle.risen |= vehicle.is_high
                 allowed = allowed_deviation(self._apart) + OFF_BY_MORE
                 if not (off := vehicle.deviation) <= allowed:
-                    self._brake(f"{name}: it is {off:.2f} m beside its place, at most {allowed:.2f} m")
+                    self._brake(f"{name}: it is {off:.2f} m from its place, at most {allowed:.2f} m")
             case SetpointSent(due=due, index=index):
                 vehicle.setpoints.append(message)
                 if vehicle.phase is Phase.STREAM and not vehicle.left:
@@ -256,7 +263,7 @@ class Conductor:
 
     def _watch_pair(self, a: _Vehicle, b: _Vehicle, now: float) -> None:
         """Compare two vehicles of which one at least flies, at the newest moment at which both were seen."""
-        if not (a.risen or b.risen) or now - min(a.poses[-1].time, b.poses[-1].time) > _OLD:
+        if not (a.is_high or b.is_high) or now - min(a.poses[-1].time, b.poses[-1].time) > _OLD:
             return
         moment = min(a.poses[-1].time, b.poses[-1].time)
         distance = math.dist(a.place(moment)[:2], b.place(moment)[:2])

@@ -6,6 +6,7 @@ or written. If the main process dies or this loop fails, all pilots notice at on
 """
 
 import contextlib
+import math
 import select
 import threading
 from collections import deque
@@ -27,6 +28,8 @@ from cfplan.flight.telemetry import Telemetry
 
 _PERIOD = 0.005  # s between looks of the conductor, if nothing comes meanwhile
 _BEAT = 0.05  # s between messages of the conductor that say nothing new; pilots brake after CONDUCTOR_SILENT without
+
+HUNG = 60.0  # s of silence; a lossy radio takes half of it to read a vehicle's tables
 
 Listen = Callable[[str, Telemetry], None]
 
@@ -74,12 +77,14 @@ def fly_together(
     listen: Listen,
     keyboard: Keyboard,
     more_orders: Callable[[], Iterable[Order]] = tuple,
+    hung_after: float = HUNG,
 ) -> FleetOutcome:
     """Fly missions as their conductor allows, and return when all vehicles are down.
 
     `listen` gets every message of every pilot, in order, in another thread. The keyboard is one that was entered in the
     main thread, so that Ctrl-C lands all. `more_orders` returns the orders since its last call that came neither by key
-    nor by signal. If one of these three raises, all land, and the first exception is raised here afterwards.
+    nor by signal. If one of these three raises, all land, and the first exception is raised here afterwards. The last
+    pilots are killed if they are silent for `hung_after`, s.
     """
     fleet = _Fleet(pilots, conductor, listen)
     with contextlib.ExitStack() as flight:
@@ -93,6 +98,7 @@ def fly_together(
             fleet.take_orders(keyboard.orders)
             fleet.take_orders(more_orders)
             fleet.pass_on()
+            fleet.end_hung_pilots(hung_after)
     if fleet.failure is not None:
         raise fleet.failure
     return FleetOutcome(fleet.outcomes, fleet.ends, conductor.brakes, conductor.begins, conductor.nearest)
@@ -110,6 +116,7 @@ class _Fleet:
         self._orders = {name: deque[Order]() for name in self._pilots}  # that a pilot does not have yet
         self._news: SimpleQueue[tuple[str, Telemetry] | None] = SimpleQueue()  # for the listener; None ends it
         self.failure: BaseException | None = None  # the first one of the listener or a source of orders
+        self._begun = REAL_CLOCK.now()
 
     @contextlib.contextmanager
     def listening(self) -> Iterator[None]:
@@ -161,6 +168,14 @@ class _Fleet:
             if connection in ready and name not in self.ends:
                 self._take(name, connection)
         self._conduct(REAL_CLOCK.now())
+
+    def end_hung_pilots(self, silence: float) -> None:
+        """Kill pilots that are silent for so long, s, once all others have ended; their vehicles are down by then."""
+        last = [name for name in self._pilots if name not in self.ends]
+        heard = max(self._begun, *(self._conductor.heard(name) for name in last), -math.inf)
+        if len(last) < len(self._pilots) and REAL_CLOCK.now() - heard > silence:
+            for name in last:
+                self._pilots[name].process.process.kill()  # its end is noticed like that of any process
 
     def _connections(self) -> Iterator[tuple[str, Connection]]:
         """Yield the connections of pilots that have not ended: what they ask of the conductor, then telemetry."""

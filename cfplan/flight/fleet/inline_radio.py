@@ -14,8 +14,8 @@ from cfplan.errors import InputError
 from cfplan.flight.radio.session import PING_PERIOD
 from cfplan.flight.setpoints.encoding import RATE
 
-PACKETS_PER_VEHICLE = RATE + RATE + 1.0 / PING_PERIOD  # a second: setpoints, poses and pings
 PACKETS_ON_BOARD = RATE + 2.0 / PING_PERIOD  # a second: poses, pings and keep-alive packets, the last two alike
+PACKETS_PER_VEHICLE = RATE + PACKETS_ON_BOARD  # a second: setpoints too
 USABLE_FRACTION = 0.75  # of a dongle's capacity; the rest is for repetitions and for packets that vehicles send
 _INLINE_SINCE = 0x0501  # firmware version of a Crazyradio 2.0, as in its USB descriptor
 _SERIAL_DIGITS = 10  # of the serial number of a dongle, whose place in the list has fewer

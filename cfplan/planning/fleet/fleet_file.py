@@ -130,8 +130,8 @@ def load_fleet_file(file: pathlib.Path) -> FleetFile:
 
 def _dongle(uri: str) -> str:
     """Return the name of the dongle in an address, as 0 in radio://0/80/2M; empty where there is none."""
-    found = re.match(r"radio://([^/]+)", uri)
-    return found[1] if found else ""
+    found = re.match(r"radio://([^/?]+)", uri)
+    return found[1].upper() if found else ""  # a serial number in either case
 
 
 def _vehicles(content: _Content, folder: pathlib.Path, places: Places) -> Iterator[FleetVehicle]:

@@ -10,7 +10,8 @@ it, but none may stop or end above it. A link that comes back after more than BA
 it is then, so from BACK on the others also keep away from where the tube has been, until all rest.
 
 A vehicle that still waits at its start stays there when all brake. Within the skew of the fleet's start every vehicle
-may still wait, so the first moment also covers the time before, when all hover at their starts.
+may still wait, so the first moment also covers the time before, when all hover at their starts or, after take-off,
+above them.
 
 A vehicle that is lost while it brakes for another reason is not part of this certificate.
 """
@@ -195,10 +196,10 @@ def _along_path(
 
 
 def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
-    begin = tube.part * np.arange(tube.boxes.shape[2]) - skew
-    end = begin + tube.part + 2.0 * skew
+    begin = tube.part * np.arange(tube.boxes.shape[2])
     soonest, latest = NOTICED
-    first, last = _braked(begin, soonest, stop, tube.rate), _braked(end, latest, stop, tube.rate)
+    first = _braked(begin, soonest, stop, tube.rate) - skew
+    last = _braked(begin + tube.part, latest, stop, tube.rate) + skew
     rests = soonest + stop[-1] - skew, latest + stop[-1] + skew
     return _Ways(
         np.floor(first / _SAMPLE).astype(np.int64),
@@ -211,7 +212,7 @@ def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
 
 
 def _braked(times: NDArray, begins: float, stop: NDArray, rate: float) -> NDArray:
-    """Return how far a vehicle is along its plan, s, at times after a loss, if it begins to brake then."""
+    """Return how far a vehicle comes along its plan, s, in `times`, s after a loss, if it brakes from `begins` on."""
     return np.asarray(np.minimum(times, begins) + np.interp(times - begins, np.arange(len(stop)) / rate, stop))
 
 

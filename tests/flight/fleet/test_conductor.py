@@ -140,6 +140,17 @@ def test_the_next_takes_off_when_the_one_before_has_risen():
     assert cleared(fleet.rise("left"), Phase.TAKE_OFF) == {"left", "right"}
 
 
+def test_one_that_has_come_down_to_a_low_start_has_risen():
+    fleet = Fleet()
+    fleet.go_on(0.1)
+    fleet.ask(Phase.ARM)
+    fleet.ask(Phase.TAKE_OFF)
+    for height in (0.6, 0.1):
+        fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.0, 0.0, height), LEVEL))
+    fleet.places["left"] = (0.0, 0.0, 0.1)
+    assert cleared(fleet.go_on(0.01), Phase.TAKE_OFF) == {"left", "right"}
+
+
 def test_all_begin_at_one_time_each_after_its_delay():
     fleet = Fleet(delay=0.7)
     said = fleet.fly()
@@ -349,8 +360,9 @@ def test_all_brake_below_the_distance_that_allowed_deviations_leave_at_any_heigh
     assert fleet.conductor.nearest == pytest.approx(distance)
 
 
+@pytest.mark.parametrize("axis", [1, 2], ids=["to the side", "in height"])
 @pytest.mark.parametrize(("apart", "off", "brakes"), [(0.3, 0.09, False), (0.3, 0.11, True), (0.4, 0.11, False)])
-def test_all_brake_when_one_is_farther_off_its_path_than_certified_whatever_its_height(apart, off, brakes):
+def test_all_brake_when_one_is_farther_off_its_path_than_certified(apart, off, brakes, axis):
     """It flies at 2 m/s along x, and is seen 20 ms late."""
     fleet = Fleet(apart=apart)
     fleet.fly()
@@ -359,11 +371,13 @@ def test_all_brake_when_one_is_farther_off_its_path_than_certified_whatever_its_
         fleet.now += 0.01
         x = 0.5 + 0.02 * tick
         fleet.hear("right", setpoint(fleet.now, (x, 0.0, 0.6)))
-        fleet.hear("right", PoseReceived(fleet.now - 0.02, fleet.now, (x - 0.04, off * (tick > 30), 0.4), LEVEL))
+        seen = [x - 0.04, 0.0, 0.6]
+        seen[axis] -= off * (tick > 30)
+        fleet.hear("right", PoseReceived(fleet.now - 0.02, fleet.now, tuple(seen), LEVEL))
         fleet.hear("left", PoseReceived(fleet.now, fleet.now, (0.0, 0.0, 0.6), LEVEL))
         said = fleet.conductor.say(fleet.now)
     assert bool(braking(said)) is brakes
-    assert ("right: it is 0.11 m beside its place" in said["left"].brakes) is brakes
+    assert ("right: it is 0.11 m from its place" in said["left"].brakes) is brakes
 
 
 @pytest.mark.parametrize(("off", "brakes"), [(0.09, False), (0.11, True)])

@@ -174,8 +174,8 @@ def test_a_radio_that_cannot_be_opened_is_an_error_of_each_pilot():
     [
         (2, PACKETS_PER_VEHICLE, 0x0501, None),
         (4, PACKETS_PER_VEHICLE, 0x0504, None),
-        (5, PACKETS_PER_VEHICLE, 0x0510, ("need 1050", "carries 975", "enough for 4 vehicles", "--on-board")),
-        (2, PACKETS_PER_VEHICLE, 0x0500, ("need 420", "carries 225", "enough for 1 vehicle", "firmware 5.1")),
+        (5, PACKETS_PER_VEHICLE, 0x0510, ("need 1100", "carries 975", "enough for 4 vehicles", "--on-board")),
+        (2, PACKETS_PER_VEHICLE, 0x0500, ("need 440", "carries 225", "enough for 1 vehicle", "firmware 5.1")),
         (2, PACKETS_PER_VEHICLE, 0x0053, ("USB set-up",)),  # a Crazyradio PA
         (6, PACKETS_ON_BOARD, 0x0501, None),
         (2, PACKETS_ON_BOARD, 0x0053, ("need 240", "carries 225", "enough for 1 vehicle")),

@@ -132,7 +132,7 @@ def test_a_pilot_that_reads_nothing_keeps_no_order_from_the_others(pilots):
     ("code", "reason", "expected"),
     [
         (ExitCode.OK, "landed", ExitCode.ENDED_BY_SAFETY),
-        (ExitCode.ENDED_BY_SAFETY, "the fleet brakes: b: it is 0.30 m beside its place", ExitCode.ENDED_BY_SAFETY),
+        (ExitCode.ENDED_BY_SAFETY, "the fleet brakes: b: it is 0.30 m from its place", ExitCode.ENDED_BY_SAFETY),
         (ExitCode.LINK_LOST, "the fleet brakes: b: it is late, then the link was lost", ExitCode.LINK_LOST),
         (ExitCode.ENDED_BY_OPERATOR, "the operator landed it", ExitCode.ENDED_BY_OPERATOR),
     ],
@@ -140,6 +140,18 @@ def test_a_pilot_that_reads_nothing_keeps_no_order_from_the_others(pilots):
 def test_a_fleet_that_had_to_brake_did_not_end_well_although_one_vehicle_had_landed(code, reason, expected):
     ends = {"a": FlightEnded(ExitCode.OK, "landed"), "b": FlightEnded(code, reason)}
     assert FleetOutcome({}, ends, "b: it is late", begins=0.0, nearest=1.0).exit_code is expected
+
+
+def test_a_pilot_that_hangs_is_ended_once_all_others_have_ended(pilots):
+    killed = threading.Event()
+    hanging = pilots["left"]
+    hanging.process.process.kill = lambda: (killed.set(), hanging.telemetry.close())
+    with flying(pilots, hung_after=0.5) as flown:
+        assert not killed.wait(1.0)  # the others would not know
+        pilots["right"].end()
+        pilots["right"].telemetry.close()
+        assert "died" in flown.result(60.0).ends["left"].reason
+    assert killed.is_set()
 
 
 def test_if_the_conductor_fails_all_pilots_notice_before_one_is_waited_for(pilots):

@@ -136,6 +136,30 @@ def test_a_link_that_comes_back_leaves_its_vehicle_where_its_tube_was(crossing, 
     assert away[0] < 0.02 if stays else away[0] > 0.2
 
 
+@pytest.mark.parametrize("skew", [0.03, 0.2])
+def test_a_vehicle_that_brakes_by_a_late_clock_counts_where_it_comes_to_rest(crossing, skew):
+    """From 1.6 to 2 s after the loss the tube is 5 cm behind the place where the other may rest; then it lies afar."""
+    other, own = crossing[0].plan, 0.4 * crossing[0].plan.trajectory.duration
+
+    def places(times):
+        return other.trajectory.at(np.clip(times, 0.0, other.trajectory.duration)).position
+
+    moments = np.arange(1.6, 2.0, 0.01)
+    begins, late = np.meshgrid(np.linspace(*NOTICED, 31), np.linspace(-skew, skew, 21))
+    braked = np.minimum(moments, begins[..., None]) + np.interp(
+        moments - begins[..., None], np.arange(len(STOP)) / RATE, STOP
+    )
+    reached = places((own + late[..., None] + braked).ravel())[:, :2]
+    boxes = np.full((1, 1, 60, 2, 3), 50.0)
+    boxes[0, 0, 40:50] = places(np.array([own - skew + STOP[-1]]))[0] - [0.05, 0.0, 0.0]
+    boxes[0, 0, 50:, :, 2] = 0.0
+    least = np.linalg.norm(reached - boxes[0, 0, 40, 0, :2], axis=1).min()
+    tube = Tube(boxes, RATE, 0.04)
+    model = LossModel(lambda plan: tube, STOP, (), CLEARANCE)
+    away = model.distances(tube, np.array([own]), (other, np.array([own])), skew)[0]
+    assert least - 0.02 < away <= least
+
+
 @pytest.mark.slow
 def test_drawn_vehicles_without_link_and_poses_keep_the_distance(coordinated, encoded, limits):
     for lost, other in (coordinated, coordinated[::-1]):
