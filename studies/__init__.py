@@ -9,8 +9,8 @@ STUDIES = {
         "blind_link_loss", "dry_runs", "exports", "faults", "fleet_faults", "fleet_flights", "fleets", "flights",
         "giving_way", "horizon", "identification", "lateness", "latency", "link_loss", "physics", "planners",
         "random_faults", "real_flights", "second_flights", "steering", "stops", "waypoints",
-        "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.robustness",
-        "paper.search", "paper.simulators", "paper.yaw_consistency",
+        "paper.architectures", "paper.baselines", "paper.hardware", "paper.inputs", "paper.labels",
+        "paper.robustness", "paper.search", "paper.simulators", "paper.yaw_consistency",
     )
 }  # fmt: skip
 """The module of each study by its name on the command line."""

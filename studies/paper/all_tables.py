@@ -19,6 +19,7 @@ from studies.runner.study import Study
 
 QUICK: Mapping[str, Mapping[str, Any]] = MappingProxyType({
     "architectures": {"paths": 2, "quick": True}, "inputs": {"paths": 2, "quick": True},
+    "labels": {"paths": 1, "quick": True},
     "robustness": {"paths": 1, "draws": 1, "quick": True}, "yaw-consistency": {"pairs": 2},
     "baselines": {"paths": 1, "quick": True}, "hardware": {"paths": 1, "quick": True},
     "simulators": {"paths": 1, "others": 1, "quick": True}, "search": {"quick": True},

@@ -46,6 +46,7 @@ SMALL_STUDIES = {
     "horizon": "--paths 1 --waypoints 5",
     "identification": "flights/identify.yaml flights/figure8.yaml --vehicles 1",
     "inputs": QUICK,
+    "labels": QUICK,
     "latency": "--requests 2 --seconds 3",
     "lateness": f"{LINE} --seconds 2",
     "link-loss": LINE,
