@@ -108,7 +108,7 @@ COLUMNS = (
            value=among("keeps_lost", mean("lost_makespan"))),
     Column("lost_seconds", "coordination then", "s", ".1f", value=among("regards_lost", quantile("lost_seconds", 0.5))),
     Column("lost_nearest", "nearest lost", "m", ".3f", meaning="of drawn vehicles without link and poses to the others "
-           "that brake", value=among("keeps_lost", smallest("lost_nearest"))),
+           "that brake, soonest, latest and between, on clocks that are early or late", value=among("keeps_lost", smallest("lost_nearest"))),
 )  # fmt: skip
 
 
@@ -239,9 +239,10 @@ def _nearest_lost(members: Sequence[FleetMember], limits: Limits, moments: int, 
             way = way[: down[0] + 1, :2] if len(down) else way[:, :2]
             for j, other in enumerate(members):
                 if j != i:
-                    begins = float(random.uniform(*NOTICED))
-                    for loss in (lost.delay + own,) if own else (-begins - 1.0, lost.delay):  # also before the start
-                        least = min(least, _least(way, _braking(other, encoded[j], loss, begins)))
+                    losses = (lost.delay + own,) if own else (-NOTICED[1] - 1.0, lost.delay)  # also before the start
+                    ways = itertools.product((*NOTICED, random.uniform(*NOTICED)), (-SKEW, 0.0, SKEW), losses)
+                    for begins, late, loss in ways:
+                        least = min(least, _least(way, _braking(other, encoded[j], loss + late, begins)))
     return float(least)
 
 
