@@ -108,7 +108,8 @@ COLUMNS = (
            value=among("keeps_lost", mean("lost_makespan"))),
     Column("lost_seconds", "coordination then", "s", ".1f", value=among("regards_lost", quantile("lost_seconds", 0.5))),
     Column("lost_nearest", "nearest lost", "m", ".3f", meaning="of drawn vehicles without link and poses to the others "
-           "that brake, soonest, latest and between, on clocks that are early or late", value=among("keeps_lost", smallest("lost_nearest"))),
+           "that brake, soonest, latest and between, on clocks that are early or late",
+           value=among("keeps_lost", smallest("lost_nearest"))),
 )  # fmt: skip
 
 
