@@ -23,13 +23,11 @@ from cfplan.flight.pilot.conducted import ConductorMessage, PilotMessage
 from cfplan.flight.pilot.keys import Keyboard, Order
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.outcome import FlightOutcome
-from cfplan.flight.pilot.process import PilotProcess, pilot_died
+from cfplan.flight.pilot.process import HUNG, PilotProcess, pilot_died
 from cfplan.flight.telemetry import Telemetry
 
 _PERIOD = 0.005  # s between looks of the conductor, if nothing comes meanwhile
 _BEAT = 0.05  # s between messages of the conductor that say nothing new; pilots brake after CONDUCTOR_SILENT without
-
-HUNG = 60.0  # s of silence; a lossy radio takes half of it to read a vehicle's tables
 
 Listen = Callable[[str, Telemetry], None]
 

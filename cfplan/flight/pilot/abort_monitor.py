@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -41,14 +41,17 @@ class Observation:
     late: float = 0.0  # s, lateness of the last setpoint
 
 
-# The measured value of each quantity that has a ladder; None while the log that reports it is gone.
-MEASURED: Mapping[str, Callable[[Observation], Triple | None]] = MappingProxyType(
+# When each quantity that has a ladder was measured, s, and its value; None while the log that reports it is gone.
+MEASURED: Mapping[str, Callable[[Observation], tuple[float, Triple] | None]] = MappingProxyType(
     {
-        "speed": lambda seen: seen.estimate.velocity if seen.estimate is not None else None,
-        "acceleration": lambda seen: seen.estimate.acceleration if seen.estimate is not None else None,
-        "angular_velocity": lambda seen: seen.status.body_rate if seen.status is not None else None,
+        "speed": lambda seen: (seen.estimate.time, seen.estimate.velocity) if seen.estimate is not None else None,
+        "acceleration": lambda seen: (
+            (seen.estimate.time, seen.estimate.acceleration) if seen.estimate is not None else None
+        ),
+        "angular_velocity": lambda seen: (seen.status.time, seen.status.body_rate) if seen.status is not None else None,
     }
 )
+_RUNGS = (Rung.BRAKE, Rung.LAND, Rung.CUT)
 
 
 class AbortMonitor:
@@ -58,7 +61,8 @@ class AbortMonitor:
         self._limits = limits
         self._voltage: float | None = None
         self._voltage_time = 0.0
-        self._since: dict[str, float] = {}
+        self._since: dict[tuple[str, Rung], float] = {}
+        """s, since when a quantity has been above the threshold of a rung, by the times of its messages."""
 
     def gravest(self, observation: Observation) -> Abort | None:
         """Return the gravest abort, None if there is no reason for one."""
@@ -128,13 +132,14 @@ class AbortMonitor:
             if apart > DISAGREEMENT_FACTOR * self._limits.pose.agreement:
                 yield AbortReason.ESTIMATE_DISAGREES.abort(Rung.BRAKE, metres=apart)
         for quantity in ON_LADDER:
-            measured, exceeded = MEASURED[quantity.ladder](observation), _NO_ABORT
-            if measured is not None:
+            time, exceeded = observation.now, _NO_ABORT
+            if (measured := MEASURED[quantity.ladder](observation)) is not None:
+                time, value = measured
                 exceeded = _ladder_abort(
-                    getattr(limits, quantity.ladder), math.hypot(*measured), AbortReason.MOTION_LIMIT,
+                    getattr(limits, quantity.ladder), math.hypot(*value), AbortReason.MOTION_LIMIT,
                     quantity=quantity.name, unit=quantity.unit,
                 )  # fmt: skip
-            yield self._lasting(quantity.name, observation.now, exceeded)
+            yield self._lasting(quantity.name, time, exceeded)
 
     def _fallen(self, observation: Observation) -> Iterator[Abort]:
         """Yield the abort of a vehicle without poses that has fallen to the floor, where its estimate is worthless."""
@@ -149,13 +154,20 @@ class AbortMonitor:
         """Return how far, m, a position is beyond the fence: walls and obstacles less the margin, without the floor."""
         return float(self._limits.space.nearest(np.array([position]), floor=False)[0][0])
 
-    def _lasting(self, name: str, now: float, abort: Abort) -> Abort:
-        """Return the abort if its reason has lasted; a single noisy value is no reason."""
-        if not abort.rung:
-            self._since.pop(name, None)
-            return abort
-        since = self._since.setdefault(name, now)
-        return abort if now - since >= self._limits.flight.patience else _NO_ABORT
+    def _lasting(self, name: str, time: float, abort: Abort) -> Abort:
+        """Return the abort with the gravest rung whose threshold has been exceeded for `patience`.
+
+        A single noisy value is no reason. Nor is one that is repeated while its log is silent, or one beyond the
+        threshold of a graver rung than those before it.
+        """
+        lasting = Rung.NONE
+        for rung in _RUNGS:
+            since = self._since.setdefault((name, rung), time)
+            if abort.rung < rung:
+                del self._since[name, rung]
+            elif time - since >= self._limits.flight.patience:
+                lasting = rung
+        return replace(abort, rung=lasting)
 
 
 def ordered(order: Order | None, *, main_gone: bool) -> Abort | None:

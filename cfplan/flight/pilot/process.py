@@ -33,6 +33,7 @@ from cfplan.flight.telemetry import Telemetry
 _SWITCH_INTERVAL = 0.0001  # s, longest time until the stream gets the interpreter back
 _THREAD_PRIORITY = STREAM_PRIORITY // 2
 _POLL_PERIOD = 0.02  # s between two polls for orders that are not keys
+HUNG = 180.0  # s without telemetry until a pilot's process is killed; it compiles and reads tables in less
 LANDING_TIMEOUT = 60.0  # s for a pilot without a main process to land
 
 
@@ -109,6 +110,7 @@ def fly(
     on_telemetry: Callable[[Telemetry], None] = lambda _: None,
     more_orders: Callable[[], Iterable[Order]] = tuple,
     keyboard: Keyboard | None = None,
+    hung_after: float = HUNG,
 ) -> FlightOutcome:
     """Fly a mission and return when the vehicle is down. Call from the main thread, so that Ctrl-C lands.
 
@@ -116,15 +118,15 @@ def fly(
     `drivers` go there by pickle. `on_telemetry` gets every message, in order; what it raises is raised here after the
     vehicle has landed. `more_orders` returns the orders since its last call that came neither by key nor by signal; it
     is called in another thread, and must not wait. `keyboard` is one that was entered before; without one it is entered
-    for the flight. Raises LinkError if the vehicle cannot be reached or the pilot's process dies, and what the pose
-    source raises.
+    for the flight. A pilot that sends nothing for `hung_after`, s, is killed. Raises LinkError if the vehicle cannot be
+    reached or the pilot's process dies, and what the pose source raises.
     """
     held = Keyboard() if keyboard is None else contextlib.nullcontext(keyboard)
     with held as entered, pilot or start_pilot(drivers) as started:
         started.assign(mission, uri, pose_source)
         attendant = Attendant(partial(_send, started.orders, threading.Lock()), entered, on_telemetry, more_orders)
         with _orders_passed(entered, attendant):
-            return _attend(started.process, started.telemetry, attendant)
+            return _attend(started, attendant, hung_after)
 
 
 class Attendant:
@@ -194,13 +196,15 @@ def _orders_passed(keyboard: Keyboard, attendant: Attendant) -> Iterator[None]:
         passing.join()
 
 
-def _attend(process: BaseProcess, telemetry: Connection, attendant: Attendant) -> FlightOutcome:
+def _attend(pilot: PilotProcess, attendant: Attendant, hung_after: float) -> FlightOutcome:
     """Pass on the telemetry of a pilot's process until its last message."""
     while True:
+        if not pilot.telemetry.poll(hung_after):
+            pilot.process.kill()
         try:
-            message = telemetry.recv()
+            message = pilot.telemetry.recv()
         except (EOFError, OSError):
-            raise pilot_died(process) from attendant.failure
+            raise pilot_died(pilot.process) from attendant.failure
         if not isinstance(message, list):
             return attendant.conclude(message)
         attendant.tell(message)

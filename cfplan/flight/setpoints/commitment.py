@@ -48,6 +48,7 @@ from cfplan.vehicle.rotations import rotations_of, yaw_of
 
 LEAST_AHEAD = 0  # least setpoints from the one just sent to a splice; the first new one follows the splice
 FARTHEST_AHEAD = 6000  # most setpoints from the clock to a splice: a minute
+MOST_SETPOINTS = 4000  # of a proposal, 40 s, which bounds the time that the pilot takes to verify them
 LONGEST_ENDING = 1000  # most unsent stops of a proposal, which bounds the memory for it
 KEPT_BEHIND = 100  # setpoints kept before the one due, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
@@ -199,6 +200,8 @@ def splice(commitment: Commitment, proposal: Proposal, now: int, limits: Limits)
     """
     if not isinstance(proposal, Proposal) or _wrong_shape(proposal.splice, proposal.payloads, proposal.stops):
         return Refusal(Fault.SHAPE, "")
+    if len(proposal.payloads) > MOST_SETPOINTS:
+        return Refusal(Fault.SHAPE, f"{len(proposal.payloads)} setpoints, at most {MOST_SETPOINTS}")
     if not 0 <= proposal.ending < len(proposal.stops):
         return Refusal(Fault.SHAPE, f"{proposal.ending} of {len(proposal.stops)} stops not sent")
     if proposal.stops.shape[1] != commitment.stops.shape[1]:
@@ -330,7 +333,12 @@ def _first_excess(
 
     if not wrong(0, len(runs), end):
         return None
-    run = bisect_left(range(len(runs) - 1), True, key=lambda n: wrong(0, n + 1, end) is not None)
+    run, count = 0, len(runs)
+    while (
+        count > 1
+    ):  # halves cost as much as all runs once, so that a refusal takes no longer than twice a verification
+        half = count // 2
+        run, count = (run, half) if wrong(run, half, end) else (run + half, count - half)
     row = bisect_left(range(end - 1), True, key=lambda n: wrong(run, 1, n + 1) is not None)
     found = wrong(run, 1, row + 1) or wrong(0, len(runs), end)
     return None if found is None else (*found, run, row)

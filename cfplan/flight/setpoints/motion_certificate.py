@@ -72,7 +72,7 @@ def motion_extremes(runs: NDArray, before: NDArray, airframe: Airframe, end: int
     for each, thrust in ((high, high[of.SPECIFIC_THRUST]), (low, low[of.SPECIFIC_THRUST])):
         each[of.MOTOR_THRUST : of.MOTOR_THRUST + 4] = thrust * airframe.mass / 4
     corners = np.array([-worst[_LOW:_ROWS], worst[_HIGH:_LOW]])
-    turn = math.acos(max(1.0 - worst[_TURNED], -1.0))
+    turn = math.acos(min(max(1.0 - worst[_TURNED], -1.0), 1.0))
     return MotionExtremes(high, low, math.sqrt(worst[_TRADED]), turn, float(worst[_JUMP]), corners)
 
 

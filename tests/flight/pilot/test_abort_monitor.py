@@ -1,6 +1,7 @@
 """Each trigger at its threshold, and its rung."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -115,6 +116,22 @@ def test_a_single_noisy_value_is_forgotten(monitor):
     assert rung(monitor, observation(now=10.0, velocity=fast)) is Rung.NONE
     assert rung(monitor, observation(now=10.05)) is Rung.NONE
     assert rung(monitor, observation(now=10.14, velocity=fast)) is Rung.NONE
+
+
+def test_one_value_beyond_a_graver_threshold_is_no_reason_for_its_rung(monitor, limits):
+    speed, patience = limits.flight.speed, limits.flight.patience
+    for now in (10.0, 10.0 + 1.1 * patience):
+        found = rung(monitor, observation(now=now, velocity=(speed.brake + 0.1, 0.0, 0.0)))
+    assert found is Rung.BRAKE
+    fast = (speed.cut + 0.1, 0.0, 0.0)
+    assert rung(monitor, observation(now=10.0 + 1.2 * patience, velocity=fast)) is Rung.BRAKE
+    assert rung(monitor, observation(now=10.0 + 2.3 * patience, velocity=fast)) is Rung.CUT
+
+
+def test_a_noisy_value_that_is_the_last_of_its_log_for_a_while_is_no_reason(monitor, limits):
+    noisy = observation(rate=(2.0 * limits.flight.angular_velocity.cut, 0.0, 0.0))
+    for later in (0.0, 0.5, 1.0, 2.0):
+        assert rung(monitor, replace(noisy, now=noisy.now + later * limits.flight.patience)) is Rung.NONE
 
 
 def test_a_body_rate_beyond_the_limit_that_lasts_brakes(monitor):

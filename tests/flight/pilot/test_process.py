@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from waiting import until
 
+from cfplan.errors import LinkError
 from cfplan.flight.pilot.keys import Keyboard, Order
 from cfplan.flight.pilot.process import OrderReceiver, PilotProcess, fly
 from cfplan.flight.pilot.proposals import ReceivedProposals
@@ -65,6 +66,14 @@ def still_pilot():
 
 def fly_with(pilot: StillPilot, **listening):
     return fly(None, uri="", pose_source=None, pilot=pilot.process, keyboard=Keyboard(keys=False), **listening)
+
+
+def test_a_pilot_that_hangs_is_killed(still_pilot):
+    killed = []
+    still_pilot.process.process.kill = lambda: (killed.append(True), still_pilot.telemetry.close())
+    with pytest.raises(LinkError, match="died"):
+        fly_with(still_pilot, hung_after=0.05)
+    assert killed
 
 
 def test_an_order_waits_for_no_listener(still_pilot):

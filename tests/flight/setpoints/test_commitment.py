@@ -25,7 +25,14 @@ from cfplan.flight.setpoints.commitment import (
     splice,
 )
 from cfplan.flight.setpoints.encoding import LEAD, RATE, encode_trajectory
-from cfplan.flight.setpoints.packets import QUATERNION_PLACE, compress_quaternion, decode
+from cfplan.flight.setpoints.motion_certificate import SPAN, motion_extremes
+from cfplan.flight.setpoints.packets import (
+    QUATERNION_PLACE,
+    FullStateSetpoints,
+    compress_quaternion,
+    decode,
+    encode,
+)
 from cfplan.flight.setpoints.stop_certificate import certify_stops
 from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.geometry.min_snap import min_snap
@@ -197,6 +204,12 @@ FAULTS = {
     ),
     "shorter stops": (lambda p: resummed(replace(p, stops=p.stops[:, 1:])), 0, Fault.SHAPE),
     "fewer stops": (lambda p: replace(p, stops=p.stops[1:]), 0, Fault.SHAPE),
+    "more than a pilot verifies in time": (
+        lambda p: resummed(
+            replace(p, payloads=np.resize(p.payloads, (5000, 29)), stops=np.resize(p.stops, (5000, *p.stops.shape[1:])))
+        ),
+        0, Fault.SHAPE,
+    ),
     "no bytes": (lambda p: replace(p, payloads=p.payloads.astype(float)), 0, Fault.SHAPE),
     "nothing": (lambda p: None, 0, Fault.SHAPE),
     "text": (lambda p: "fly!", 0, Fault.SHAPE),
@@ -318,6 +331,17 @@ def test_a_heading_that_turns_at_once_is_refused_in_setpoints_and_in_their_stops
         refused = splice(committed, resummed(broken), 110, limits)
         assert isinstance(refused, Refusal)
         assert refused.fault in (Fault.LIMITS, Fault.STOPS)
+
+
+def test_two_setpoints_of_any_pitch_turn_the_heading_by_nothing(limits):
+    """Alone, so that a rounding below zero is the worst value."""
+    pitches = np.linspace(-0.35, 0.35, 141)
+    turns = np.stack([0.0 * pitches, np.sin(pitches / 2), 0.0 * pitches, np.cos(pitches / 2)], axis=1)
+    still = np.zeros((141, 3))
+    payloads = encode(FullStateSetpoints(still, still, still, turns, still))
+    for row in range(140):
+        run, before = payloads[None, row : row + 2], payloads[[row] * (SPAN + 1)]
+        assert motion_extremes(run, before, limits.airframe, end=1).turn < 1e-6
 
 
 def test_setpoints_that_only_claim_to_be_a_stop_are_refused(committed, spliced, limits):
