@@ -144,7 +144,7 @@ def test_all_brake_when_a_short_loss_of_a_link_takes_a_vehicle_off_its_path():
     """By itself its pilot would fly on: it takes the uplink for gone after 0.5 s only."""
     fleet = fleet_of()
     flight = fleet.fly(streaming(fleet, "left", 0.6, lose_link(fleet, 0.3)))
-    off = re.match(r"left: it is ([0-9.]+) m beside its place", flight.brakes)
+    off = re.match(r"left: it is ([0-9.]+) m from its place", flight.brakes)
     assert off is not None, flight.brakes
     assert allowed_deviation(APART) + OFF_BY_MORE < float(off[1]) + 0.005 < 0.3
     assert_all_down(flight)
