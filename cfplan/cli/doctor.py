@@ -105,8 +105,8 @@ def _priority() -> dict[str, str]:
         return _check("priority", f"SCHED_FIFO, {STREAM_PRIORITY}")
     line = f"$USER - rtprio {STREAM_PRIORITY}"
     hint = (
-        "setpoints wait for other programs; permit real-time scheduling, and log in anew: "
-        f'`echo "{line}" | sudo tee /etc/security/limits.d/99-cfplan.conf`'
+        "setpoints wait for other programs; permit real-time scheduling by "
+        f'`echo "{line}" | sudo tee /etc/security/limits.d/99-cfplan.conf`, then log in again'
     )
     return _check("priority", "ordinary", "optional", hint)
 

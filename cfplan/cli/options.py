@@ -135,8 +135,8 @@ def planning(command: Callable) -> Callable:
 def find_safety_file(given: Path | None, path_file: Path) -> Path:
     """Return the safety.yaml to use: the one given, or the nearest in or above the working folder or the path file.
 
-    The path file's counts first if it lies within the working folder, else that of the working folder. Raises
-    InputError if there is none.
+    Looks from the path file's folder upwards if it lies within the working folder; else from the working folder first.
+    Raises InputError if there is none.
     """
     if given is not None:
         return given

@@ -1,8 +1,8 @@
 """Repeat flights of the paper's tables with the bodies of RotorPy, at two motor lags, and of drone-models.
 
-The paper flies in RotorPy. This study flies Tables 1 to 3 in RotorPy with the motor lag that it had then, and a sample
-of each kind of table with RotorPy's present lag too, and in drone-models where it knows the vehicle. The controller is
-the same as in the table: the geometric one, or the firmware's with the same packets.
+The paper flies in RotorPy. This study flies Tables 1 to 3 in RotorPy with the motor lag of its version then, and a
+sample of each kind of table with RotorPy's present lag too, and in drone-models where it knows the vehicle. The
+controller is the same as in the table: the geometric one, or the firmware's with the same packets.
 """
 
 from collections.abc import Iterator, Mapping

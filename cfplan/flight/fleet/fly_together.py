@@ -81,8 +81,8 @@ def fly_together(
 
     `listen` gets every message of every pilot, in order, in another thread. The keyboard is one that was entered in the
     main thread, so that Ctrl-C lands all. `more_orders` returns the orders since its last call that came neither by key
-    nor by signal. If one of these three raises, all land, and the first exception is raised here afterwards. The last
-    pilots are killed if they are silent for `hung_after`, s.
+    nor by signal. If one of these three raises, all land, and the first exception is raised here afterwards. Pilots
+    are killed if none of those that remain has sent anything for `hung_after`, s.
     """
     fleet = _Fleet(pilots, conductor, listen)
     with contextlib.ExitStack() as flight:
@@ -168,10 +168,10 @@ class _Fleet:
         self._conduct(REAL_CLOCK.now())
 
     def end_hung_pilots(self, silence: float) -> None:
-        """Kill pilots that are silent for so long, s, once all others have ended; their vehicles are down by then."""
+        """Kill the remaining pilots after `silence`, s, without a message of any; their vehicles are down by then."""
         last = [name for name in self._pilots if name not in self.ends]
         heard = max(self._begun, *(self._conductor.heard(name) for name in last), -math.inf)
-        if len(last) < len(self._pilots) and REAL_CLOCK.now() - heard > silence:
+        if REAL_CLOCK.now() - heard > silence:
             for name in last:
                 self._pilots[name].process.process.kill()  # its end is noticed like that of any process
 

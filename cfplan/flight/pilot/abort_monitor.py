@@ -155,10 +155,10 @@ class AbortMonitor:
         return float(self._limits.space.nearest(np.array([position]), floor=False)[0][0])
 
     def _lasting(self, name: str, time: float, abort: Abort) -> Abort:
-        """Return the abort with the gravest rung whose threshold has been exceeded for `patience`.
+        """Return the abort at the gravest rung whose threshold has been exceeded for `patience`, by message times.
 
-        A single noisy value is no reason. Nor is one that is repeated while its log is silent, or one beyond the
-        threshold of a graver rung than those before it.
+        Each rung has its own time, so that one value beyond a graver threshold is no reason for that rung; and a value
+        that is repeated while its log is silent does not last.
         """
         lasting = Rung.NONE
         for rung in _RUNGS:

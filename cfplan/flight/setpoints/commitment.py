@@ -48,7 +48,7 @@ from cfplan.vehicle.rotations import rotations_of, yaw_of
 
 LEAST_AHEAD = 0  # least setpoints from the one just sent to a splice; the first new one follows the splice
 FARTHEST_AHEAD = 6000  # most setpoints from the clock to a splice: a minute
-MOST_SETPOINTS = 4000  # of a proposal, 40 s, which bounds the time that the pilot takes to verify them
+MOST_SETPOINTS = 4000  # of a proposal, 40 s; a planner proposes parts that are shorter. Bounds the time to verify it
 LONGEST_ENDING = 1000  # most unsent stops of a proposal, which bounds the memory for it
 KEPT_BEHIND = 100  # setpoints kept before the one due, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
@@ -334,9 +334,8 @@ def _first_excess(
     if not wrong(0, len(runs), end):
         return None
     run, count = 0, len(runs)
-    while (
-        count > 1
-    ):  # halves cost as much as all runs once, so that a refusal takes no longer than twice a verification
+    # Halving looks at no more runs than all of them once again, so a refusal costs two verifications at most.
+    while count > 1:
         half = count // 2
         run, count = (run, half) if wrong(run, half, end) else (run + half, count - half)
     row = bisect_left(range(end - 1), True, key=lambda n: wrong(run, 1, n + 1) is not None)

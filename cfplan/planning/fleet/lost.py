@@ -212,7 +212,7 @@ def _ways(tube: Tube, stop: NDArray, skew: float, far: float) -> _Ways:
 
 
 def _braked(times: NDArray, begins: float, stop: NDArray, rate: float) -> NDArray:
-    """Return how far a vehicle comes along its plan, s, in `times`, s after a loss, if it brakes from `begins` on."""
+    """Return the time on its plan, s, that a vehicle has reached `times`, s, after a loss; it brakes from `begins`."""
     return np.asarray(np.minimum(times, begins) + np.interp(times - begins, np.arange(len(stop)) / rate, stop))
 
 

@@ -142,16 +142,17 @@ def test_a_fleet_that_had_to_brake_did_not_end_well_although_one_vehicle_had_lan
     assert FleetOutcome({}, ends, "b: it is late", begins=0.0, nearest=1.0).exit_code is expected
 
 
-def test_a_pilot_that_hangs_is_ended_once_all_others_have_ended(pilots):
-    killed = threading.Event()
-    hanging = pilots["left"]
-    hanging.process.process.kill = lambda: (killed.set(), hanging.telemetry.close())
+@pytest.mark.parametrize("others", ["have ended", "hang too"])
+def test_pilots_that_hang_are_killed_once_all_others_have_ended(pilots, others):
+    for pilot in pilots.values():
+        pilot.process.process.kill = pilot.telemetry.close
     with flying(pilots, hung_after=0.5) as flown:
-        assert not killed.wait(1.0)  # the others would not know
-        pilots["right"].end()
-        pilots["right"].telemetry.close()
-        assert "died" in flown.result(60.0).ends["left"].reason
-    assert killed.is_set()
+        if others == "have ended":
+            pilots["right"].end()
+            pilots["right"].telemetry.close()
+        ends = flown.result(60.0).ends
+    assert "died" in ends["left"].reason
+    assert ("died" in ends["right"].reason) is (others == "hang too")
 
 
 def test_if_the_conductor_fails_all_pilots_notice_before_one_is_waited_for(pilots):
