@@ -99,6 +99,7 @@ class InlineCrazyradio:
         self.vehicles, self._pass_time = vehicles, pass_time
         self.handle, self.inline, self.closed = self, False, False
         self.log: list[tuple[int, bytes]] = []  # last byte of the address, and frame
+        self.headers: list[bytes] = []
         self.late = False  # the next answer comes after the time-out
         self.broken = False
         self.short = False  # the next answer is cut short
@@ -118,6 +119,7 @@ class InlineCrazyradio:
         if self.broken:
             raise USBTimeoutError("timed out", None, errno.ETIMEDOUT)
         self.log.append((data[7], bytes(data[8:])))
+        self.headers.append(bytes(data[:8]))
         vehicle = self.vehicles.get(data[7])
         content = vehicle.exchange(bytes(data[8:])) if vehicle is not None else None
         self._pass_time(self.air_time if content is not None else UNACKNOWLEDGED_TIME)

@@ -84,6 +84,14 @@ class Shared:
         return [struct.unpack_from("<f", packet, 2)[0] for packet in packets]
 
 
+def test_each_frame_goes_out_on_the_channel_the_rate_and_the_address_of_its_vehicle():
+    usb = InlineCrazyradio({}, lambda duration: None)
+    radio = InlineRadio(usb)
+    radio.exchange(RadioAddress(80, 2, (0xE7, 0xE7, 0xE7, 0xE7, 1)), NULL)
+    radio.exchange(RadioAddress(10, 1, (1, 2, 3, 4, 5)), NULL)
+    assert usb.headers == [b"\x09\x12\x50\xe7\xe7\xe7\xe7\x01", b"\x09\x11\x0a\x01\x02\x03\x04\x05"]
+
+
 def test_over_a_lossy_radio_each_packet_arrives_once_and_in_order_both_ways():
     shared = Shared(*(RadioVehicle(loss=0.3) for _ in range(3)))
     for number in range(60):
