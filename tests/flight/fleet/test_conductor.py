@@ -17,6 +17,7 @@ from cfplan.flight.fleet.conductor import (
     Stage,
 )
 from cfplan.flight.pilot.conducted import CONDUCTOR_SILENT, ClearanceAsked, ConductorMessage, HeldConductor, PlanLeft
+from cfplan.flight.pilot.health import UPLINK_GONE
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import (
     Estimate,
@@ -28,6 +29,7 @@ from cfplan.flight.telemetry import (
     SetpointSent,
     VehicleStatus,
 )
+from cfplan.planning.fleet.lost import NOTICED
 
 APART, SKEW = 0.3, 0.03
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -314,6 +316,12 @@ def test_all_brake_when_a_pilot_is_silent():
     assert not braking(fleet.go_on(PILOT_SILENT - 0.05))
     assert braking(fleet.go_on(0.1)) == {"left", "right"}
     assert "right" in fleet.conductor.brakes
+
+
+def test_a_silent_pilot_and_a_dead_link_are_noticed_as_soon_as_the_certificate_of_lost_vehicles_takes_it():
+    orders = 0.1  # s, of the conductor's tick and its orders
+    assert PILOT_SILENT + orders <= NOTICED[1]
+    assert UPLINK_GONE + orders <= NOTICED[1]
 
 
 def test_no_pilot_waits_forever_for_one_that_fell_silent_in_preflight():
