@@ -53,6 +53,13 @@ def test_the_same_frame_again_is_repeated():
     assert check.judge((i - 1) * PERIOD, flown((i - 1) * PERIOD), i - 1) is Verdict.REPEATED
 
 
+@pytest.mark.parametrize("frames", [1, 3, 30])
+def test_an_older_frame_that_comes_late_is_repeated(frames):
+    check, i = check_after()
+    time = (i - 1 - frames) * PERIOD
+    assert check.judge(time, flown(time), i - 1 - frames) is Verdict.REPEATED
+
+
 @pytest.mark.parametrize("numbers", [True, False], ids=["numbered", "without numbers"])
 def test_new_frames_with_the_old_pose_are_frozen(numbers):
     check, i = check_after()
