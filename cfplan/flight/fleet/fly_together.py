@@ -6,7 +6,6 @@ or written. If the main process dies or this loop fails, all pilots notice at on
 """
 
 import contextlib
-import math
 import select
 import threading
 from collections import deque
@@ -170,7 +169,7 @@ class _Fleet:
     def end_hung_pilots(self, silence: float) -> None:
         """Kill the remaining pilots after `silence`, s, without a message of any; their vehicles are down by then."""
         last = [name for name in self._pilots if name not in self.ends]
-        heard = max(self._begun, *(self._conductor.heard(name) for name in last), -math.inf)
+        heard = max([self._begun, *(self._conductor.heard(name) for name in last)])
         if REAL_CLOCK.now() - heard > silence:
             for name in last:
                 self._pilots[name].process.process.kill()  # its end is noticed like that of any process
