@@ -17,12 +17,11 @@ from cfplan.preparation.plan_flight import FlightOptions
 from cfplan.preparation.prepare_flight import encode_flight
 from cfplan.safety.limits import Limits
 from cfplan.simulation.dry_run import dry_run
-from studies.fault_scenarios import Scenario
-from studies.faults import fly_stepped
 from studies.runner.limits import limits_for
 from studies.runner.options import argument
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import Scenario, fly_stepped
 
 
 @dataclass(frozen=True, slots=True)

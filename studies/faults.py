@@ -1,49 +1,29 @@
-"""Fly along PATH at full speed with one fault per flight, and judge the pilot's reaction by the simulated truth.
+"""Fly along PATH at full speed with one fault per flight, and judge the pilot's reaction by the simulated truth."""
 
-In the stepped lab (`cfplan.simulation.lab.stepped_lab`) the pilot, the packets, the pose tracker, the virtual Crazyflie
-and the virtual cameras are those of a flight in real time; there are no processes and no sockets.
-"""
-
-import math
-import tempfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
+from math import pi
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
-
-from cfplan.air.requests import PathAnswer, Wish
-from cfplan.air.stepped import SteppedPlanner
-from cfplan.air.timeline import Timeline, hold
-from cfplan.errors import CfplanError, ExitCode, InputError
-from cfplan.flight.pilot.keys import HeldOrders
-from cfplan.flight.pilot.mission import Mission
-from cfplan.flight.pilot.outcome import FlightOutcome, Rung
-from cfplan.flight.pilot.pilot import Pilot
-from cfplan.flight.pilot.proposals import NO_PROPOSALS
-from cfplan.flight.setpoints.packets import decode
-from cfplan.flight.telemetry import Event, Phase, PhaseEntered, SetpointSent, Telemetry, Triple
-from cfplan.geometry.path_file import load_path_file
-from cfplan.preparation.plan_flight import plan_flight
+from cfplan.air.stepped import PlannerFault
+from cfplan.flight.pilot.keys import Order
+from cfplan.flight.pilot.outcome import Rung
+from cfplan.flight.telemetry import Phase
 from cfplan.preparation.prepare_flight import prepare_mission
-from cfplan.recording.header import RecordHeader, header_under
-from cfplan.recording.reader import read_record
-from cfplan.recording.writer import RecordWriter, new_file
-from cfplan.safety.limits import Limits
-from cfplan.safety.space import Space
-from cfplan.simulation.lab.lab import Truth
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
-from cfplan.simulation.lab.stepped_lab import SteppedLab
-from cfplan.simulation.lab.stepped_link import SteppedPoses, connect
-from cfplan.simulation.virtual_crazyflie.supervisor import State
-from studies.fault_scenarios import ASKED, SCENARIOS, Scenario
+from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.simulation.virtual_vicon.cameras import ViconSettings
+from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import FOR_GOOD, FaultFlight, Scenario, fly_scenario, prepare_timeline
 
+ASKED_AFTER = 0.8  # s after the stream began
 COLUMNS = (
     Column("name", "fault"),
     Column("expected", "must end in", meaning="the rung of the abort ladder that the fault must lead to"),
@@ -66,12 +46,108 @@ COLUMNS = (
            value=lambda rows: "readable" if rows[0].readable else "not readable"),
     Column("why", "why", value=lambda rows: rows[0].planner if rows[0].reason == "landed" else rows[0].reason),
 )  # fmt: skip
-_DOWN = 0.05  # m
-_SETTLING = 0.1  # s until the supervisor reports that the vehicle was disarmed
-_AFTERWARDS = 6.0  # s that the vehicle gets to come to rest after the pilot ended
-_LONGEST = 100.0  # s; a vehicle that is left to itself on the floor disarms 30 s after arming
-_ARMED = (State.ARMING, State.READY_TO_FLY, State.FLYING, State.WARNING_LEVEL_OUT, State.LANDED)
-_RUNGS = tuple(f"{rung.name.lower()}:" for rung in Rung)  # an event that names a rung begins with one of these
+
+
+def _poses(name: str, kind: FaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:
+    return Scenario(name, rung, (ViconFault(kind, 0.0, duration, size),))
+
+
+def _radio(name: str, kind: RadioFaultKind, rung: Rung, duration: float, size: float | None = None) -> Scenario:
+    return Scenario(name, rung, (RadioFault(kind, 0.0, duration, size),))
+
+
+def _vehicle(name: str, kind: VehicleFaultKind, rung: Rung, duration: float, **changes: Any) -> Scenario:
+    return Scenario(name, rung, (VehicleFault(kind, 0.0, duration),), **changes)
+
+
+def _odd(name: str, *, grounded: bool = False, **settings: Any) -> Scenario:
+    """Return a scenario with unusual vehicle settings."""
+    return Scenario(name, Rung.NONE, vehicle=VehicleSettings(auto_arming=False, **settings), grounded=grounded)
+
+
+SCENARIOS: tuple[Scenario, ...] = (
+    _poses("poses stop for 0.05 s", FaultKind.OCCLUDE, Rung.NONE, 0.05),
+    _poses("poses stop for 0.1 s", FaultKind.OCCLUDE, Rung.NONE, 0.1),
+    _poses("poses stop for 0.3 s", FaultKind.OCCLUDE, Rung.BRAKE, 0.3),
+    _poses("poses stop for 1 s", FaultKind.OCCLUDE, Rung.LAND, 1.0),
+    _poses("poses stop for 5 s", FaultKind.OCCLUDE, Rung.LAND, 5.0),
+    _poses("poses stop for good", FaultKind.STALL, Rung.LAND, FOR_GOOD),
+    _poses("frozen pose for good", FaultKind.FREEZE, Rung.LAND, FOR_GOOD),
+    _poses("frozen pose for 0.3 s", FaultKind.FREEZE, Rung.BRAKE, 0.3),
+    _poses("same frame again for 1 s", FaultKind.REPEAT, Rung.LAND, 1.0),
+    _poses("pose 5 cm off for 1 s", FaultKind.JUMP, Rung.NONE, 1.0, 0.05),
+    _poses("pose 35 cm off for 0.7 s", FaultKind.JUMP, Rung.LAND, 0.7, 0.35),
+    _poses("pose 1 m off for 1 s", FaultKind.JUMP, Rung.LAND, 1.0, 1.0),
+    _poses("pose 1 m off for good", FaultKind.JUMP, Rung.LAND, FOR_GOOD, 1.0),
+    _poses("yaw turned by 180° for 1 s", FaultKind.FLIP, Rung.LAND, 1.0, pi),
+    _poses("yaw turned by 180° for good", FaultKind.FLIP, Rung.LAND, FOR_GOOD, pi),
+    _poses("NaN pose for 1 s", FaultKind.BREAK, Rung.LAND, 1.0),
+    _poses("poses 200 ms late for 1 s", FaultKind.DELAY, Rung.LAND, 1.0, 0.2),
+    _poses("poses 200 ms late for good", FaultKind.DELAY, Rung.LAND, FOR_GOOD, 0.2),
+    _poses("Vicon's connection reset, back after 0.5 s", FaultKind.CLOSE, Rung.LAND, 0.5),
+    _radio("radio loses 10 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.1),
+    _radio("radio loses 30 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.3),
+    _radio("radio loses 50 %", RadioFaultKind.LOSS, Rung.NONE, FOR_GOOD, 0.5),
+    _radio("radio 30 ms slower", RadioFaultKind.DELAY, Rung.NONE, FOR_GOOD, 0.03),
+    _radio("radio dead for 0.3 s", RadioFaultKind.DEAD, Rung.NONE, 0.3),
+    _radio("radio dead for 0.8 s", RadioFaultKind.DEAD, Rung.LAND, 0.8),
+    Scenario(
+        "radio dead for 3 s", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),), falls=True
+    ),
+    Scenario(
+        "radio dead for 3 s while going to the start", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),),
+        phase=Phase.GO_TO_START, moment=0.5, falls=True,
+    ),
+    Scenario(
+        "radio dead for 3 s while taking off", Rung.CUT, (RadioFault(RadioFaultKind.DEAD, 0.0, 3.0),),
+        phase=Phase.TAKE_OFF, moment=0.5, falls=True,
+    ),
+    Scenario("stream stalled for 0.2 s", Rung.NONE, stall=0.2),
+    Scenario("stream stalled for 0.6 s", Rung.BRAKE, stall=0.6),
+    Scenario("stream stalled for 2.5 s", Rung.CUT, stall=2.5, falls=True),
+    Scenario("main process killed", Rung.LAND, main_killed=True),
+    Scenario("pilot killed", Rung.NONE, pilot_killed=True, falls=True),
+    _vehicle("battery sags to 3.1 V", VehicleFaultKind.BATTERY, Rung.LAND, FOR_GOOD),
+    _vehicle("one motor at 70 %", VehicleFaultKind.MOTOR, Rung.NONE, FOR_GOOD),
+    _vehicle("mass +20 %", VehicleFaultKind.MASS, Rung.LAND, FOR_GOOD, from_start=True),
+    _vehicle("gust of 1 m/s for 1 s", VehicleFaultKind.GUST, Rung.NONE, 1.0),
+    _vehicle("supervisor locks", VehicleFaultKind.LOCK, Rung.CUT, FOR_GOOD, falls=True),
+    _vehicle("vehicle tumbles", VehicleFaultKind.TUMBLE, Rung.CUT, 0.3, falls=True),
+    _odd("parameter refused", grounded=True, stubborn=("stabilizer.controller",)),
+    _odd("parameters answered 0.5 s late", parameter_delay=0.5),
+    Scenario(
+        "locked between arming and take-off", Rung.NONE, (VehicleFault(VehicleFaultKind.LOCK, 0.0, FOR_GOOD),),
+        phase=Phase.ARM, moment=0.2, grounded=True,
+    ),
+    _odd("firmware of 2025.09", grounded=True, protocol=10, firmware="2025.09"),
+    _odd("firmware of 2025.12", grounded=True, protocol=10, firmware="2025.12"),
+    _odd("start place 0.5 m off", position=(0.35, -2.85, 0.0)),
+    Scenario(
+        "two bodies swapped", Rung.NONE, (ViconFault(FaultKind.SWAP, 0.0, FOR_GOOD),), from_start=True, grounded=True,
+        falls=True, cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
+    ),
+    Scenario(
+        "two bodies swapped in the stream", Rung.LAND, (ViconFault(FaultKind.SWAP, 0.0, FOR_GOOD),),
+        cameras=ViconSettings(others=(("cf2", (0.5, 0.5, 0.0)),)),
+    ),
+    Scenario(
+        "space bar during preflight", Rung.NONE, order=Order.LAND, phase=Phase.PREFLIGHT, moment=0.2, grounded=True,
+    ),
+    Scenario("space bar during take-off", Rung.LAND, order=Order.LAND, phase=Phase.TAKE_OFF, moment=0.7),
+    Scenario("space bar on the way to the start", Rung.LAND, order=Order.LAND, phase=Phase.GO_TO_START, moment=0.5),
+    Scenario("space bar in the stream", Rung.LAND, order=Order.LAND),
+    Scenario("space bar in the hover behind it", Rung.LAND, order=Order.LAND, phase=Phase.HOLD, moment=0.2),
+    Scenario("space bar while landing", Rung.LAND, order=Order.LAND, phase=Phase.LAND, moment=0.5),
+    Scenario("Esc in the stream", Rung.CUT, order=Order.CUT),
+    Scenario("disk full", Rung.NONE, disk_full=True),
+    Scenario("planner killed", Rung.NONE, planner=PlannerFault.KILLED, moment=ASKED_AFTER),
+    Scenario("planner stopped for 1 s", Rung.NONE, planner=PlannerFault.STOPPED, moment=ASKED_AFTER),
+    Scenario("planner answers late", Rung.NONE, planner=PlannerFault.LATE, moment=ASKED_AFTER),
+    Scenario("planner answers garbage", Rung.NONE, planner=PlannerFault.GARBAGE, moment=ASKED_AFTER),
+    Scenario(
+        "planner answers with a plan for another joint", Rung.NONE, planner=PlannerFault.OTHER_JOINT, moment=ASKED_AFTER
+    ),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,63 +156,6 @@ class Settings:
 
     path_file: Path = argument()
     only: tuple[str, ...] = option((), "Faults whose name contains this text.")
-
-
-class PilotKilled(BaseException):
-    """Simulates the sudden death of the pilot's process."""
-
-
-@dataclass(frozen=True, slots=True)
-class FaultFlight:
-    """One flight with faults, judged by the truth."""
-
-    name: str  # of the scenario
-    phase: str  # in which the fault begins
-    expected: str
-    rung: str
-    reaction: float | None  # s from the fault to the first rung; None if the pilot took none
-    off_plan: float  # m, largest distance of the true position from the planned path; horizontal once landing begins
-    off_setpoint: float  # m, largest distance of the true position from the setpoint, until landing begins
-    to_wall: float  # m, least distance of the true position from walls and ceiling; negative beyond them
-    highest: float  # m above the floor
-    rest: Triple  # m, where it came to rest
-    motors_off: int  # ms with all motors off in the air
-    landed: bool  # on the floor, motors off
-    disarmed: bool
-    locked: bool  # the supervisor locked at some time
-    readable: bool  # the record can be read
-    reason: str
-    planner: str  # its answer; empty if it was not asked or did not answer
-    seed: int = 0  # of the flight's random faults
-    path: str = ""  # set where a study flies several paths
-
-    @property
-    def bad(self) -> bool:
-        """Return whether the vehicle left the walls, did not land or disarm, or left no readable record."""
-        return not (self.to_wall > 0.0 and self.landed and self.disarmed and self.readable)
-
-    @property
-    def end(self) -> str:
-        """Return how the flight ended, in words."""
-        ends = [text for text, holds in (("landed", self.landed), ("disarmed", self.disarmed)) if holds]
-        without = f", {self.motors_off} ms without motors" if self.motors_off else ""
-        return (", ".join(ends) or "in the air") + without
-
-
-@dataclass(slots=True)
-class SteppedFlight:
-    """The outcome of a flight in the stepped lab, with its truth and messages."""
-
-    outcome: FlightOutcome | None  # None where the pilot was killed, or never flew
-    reason: str
-    truth: Truth
-    struck: float  # s, when the fault began; NaN if it was active from the start or never began
-    events: list[tuple[float, str]] = field(default_factory=list)
-    answers: list[PathAnswer] = field(default_factory=list)  # the planner's
-    sent: list[tuple[float, Triple]] = field(default_factory=list)  # (s, m) of each setpoint of the plan
-    landing: float = math.inf  # s, when the last phase of landing began
-    killed: bool = False  # the pilot was killed, in flight or before
-    ended: bool = False  # the pilot returned or raised
 
 
 def work(settings: Settings, run: Run) -> Work:
@@ -151,229 +170,6 @@ def work(settings: Settings, run: Run) -> Work:
 def tables(settings: Settings, rows: list[FaultFlight]) -> Iterator[Table]:
     """Yield a table with one row per fault."""
     yield table("faults", "Faults at full speed", COLUMNS, rows)
-
-
-def prepare_timeline(source: Path, limits: Limits) -> Timeline:
-    """Plan a path file and return the flight as the in-flight planner holds it. Raises what planning raises."""
-    return hold(plan_flight(source, limits).plan, load_path_file(source).waypoints)
-
-
-def fly_scenario(
-    scenario: Scenario, mission: Mission, seed: int = 0, *, timeline: Timeline | None = None
-) -> FaultFlight:
-    """Fly a scenario, record it, and judge it by the truth. A planner fault needs a `timeline`."""
-    if scenario.planner is not None:
-        if timeline is None:
-            raise InputError(
-                "no planner flies with a mission alone",
-                where=scenario.name,
-                hint="give what prepare_timeline() returns",
-            )
-        mission = Mission(timeline.commitment.payloads, timeline.commitment.stops, mission.limits)
-    lab = _lab(scenario, mission, seed)
-    with tempfile.TemporaryDirectory() as folder:
-        writer = RecordWriter(
-            Path(folder),
-            _header(mission),
-            warn=lambda _: None,
-            open_file=_FullDisk if scenario.disk_full else new_file,
-            clock=lab.clock,
-        )
-        with writer:
-            flown = fly_stepped(scenario, mission, listen=writer.write, lab=lab, timeline=timeline)
-        try:
-            readable = len(read_record(Path(folder)).phases.time) > 0
-        except CfplanError:
-            readable = False
-    return judge(scenario, flown, mission, readable)
-
-
-def fly_stepped(
-    scenario: Scenario,
-    mission: Mission,
-    *,
-    listen: Callable[[Telemetry], None] = lambda _: None,
-    seed: int = 0,
-    lab: SteppedLab | None = None,
-    timeline: Timeline | None = None,
-) -> SteppedFlight:
-    """Fly a scenario in a stepped lab, by default a new one with this seed, until everything has come to rest."""
-    lab = lab or _lab(scenario, mission, seed)
-    orders, flown, begin = HeldOrders(), SteppedFlight(None, "", lab.truth(), math.nan), lab.now
-    planner = None
-    if scenario.planner is not None and timeline is not None:
-        planner = SteppedPlanner(timeline, mission.limits, lab.clock, flown.answers.append)
-
-    def hear(message: Telemetry) -> None:
-        if flown.killed:
-            return
-        listen(message)
-        if isinstance(message, Event):
-            flown.events.append((message.time, message.text))
-        elif isinstance(message, SetpointSent):
-            flown.sent.append((message.time, message.position))
-        elif isinstance(message, PhaseEntered):
-            if message.phase is Phase.LAND:
-                flown.landing = message.time
-            if message.phase is scenario.phase and math.isnan(flown.struck):
-                lab.clock.at(message.time + scenario.moment, lambda: _strike(scenario, lab, flown, orders, planner))
-
-    if scenario.from_start:
-        for fault in scenario.faults:
-            lab.disturb(fault)
-    pilot = Pilot(
-        mission,
-        connect=lambda waiting: connect(lab, hear),
-        source=SteppedPoses(lab, mission.limits.pose),
-        report=hear,
-        orders=orders,
-        proposals=planner or NO_PROPOSALS,
-        clock=lab.clock,
-    )
-    try:
-        flown.outcome = pilot.fly()
-        flown.reason = flown.outcome.reason
-    except PilotKilled:
-        flown.reason = "the pilot was killed"
-    except CfplanError as error:
-        flown.reason = str(error)
-    flown.ended = True
-    lab.clock.sleep(_SETTLING)
-    flown.truth = lab.truth()
-    if not on_floor(flown.truth):
-        lab.clock.sleep(_AFTERWARDS)
-        flown.truth = lab.truth()
-    while scenario.leaves_alone and flown.truth.supervisor[-1] in _ARMED and lab.now < begin + _LONGEST:
-        lab.clock.sleep(_AFTERWARDS)
-        flown.truth = lab.truth()
-    return flown
-
-
-def _strike(
-    scenario: Scenario, lab: SteppedLab, flown: SteppedFlight, orders: HeldOrders, planner: SteppedPlanner | None
-) -> None:
-    """Apply the faults and orders of a scenario now, or schedule them."""
-
-    def kill() -> None:
-        if flown.ended:
-            return
-        flown.killed = True
-        lab.disturb(RadioFault(RadioFaultKind.DEAD))  # the pilot's cleanup code must not reach the vehicle
-        raise PilotKilled
-
-    flown.struck = lab.now
-    for fault in scenario.faults if not scenario.from_start else ():
-        lab.disturb(fault)
-    orders.worst = scenario.order
-    if planner is not None:
-        planner.fault = scenario.planner
-        planner.request(Wish.REPLACE, [ASKED])
-    if scenario.stall:
-        lab.clock.at(lab.now + scenario.stall_after, lambda: lab.clock.stall(scenario.stall))
-    if scenario.main_killed:
-        lab.clock.at(lab.now + scenario.main_killed_after, lambda: setattr(orders, "gone", True))
-    if scenario.pilot_killed:
-        lab.clock.at(lab.now + scenario.pilot_killed_after, kill)
-
-
-def _lab(scenario: Scenario, mission: Mission, seed: int) -> SteppedLab:
-    return SteppedLab(mission.limits.airframe, vehicle=scenario.vehicle, cameras=scenario.cameras, seed=seed)
-
-
-def judge(scenario: Scenario, flown: SteppedFlight, mission: Mission, readable: bool) -> FaultFlight:
-    """Return the verdict on a flight, by the simulated truth."""
-    truth, outcome = flown.truth, flown.outcome
-    rung = outcome.rung if outcome is not None else Rung.NONE
-    rungs = (time for time, text in flown.events if time >= flown.struck and text.startswith(_RUNGS))
-    reaction = next((time - flown.struck for time in rungs), None)
-    flew = (
-        outcome is not None and Phase.TAKE_OFF in dict(outcome.phases) and outcome.exit_code is not ExitCode.PREFLIGHT
-    )
-    return FaultFlight(
-        name=scenario.name,
-        phase=str(scenario.phase),
-        expected="no take-off" if scenario.grounded else scenario.rung.name.lower(),
-        rung=rung.name.lower() if flew or flown.killed else "no take-off",
-        reaction=reaction,
-        off_plan=_off_plan(flown, mission),
-        off_setpoint=_off_setpoint(flown, mission),
-        to_wall=to_wall(truth, mission.limits.space),
-        highest=float(truth.position[:, 2].max()),
-        rest=tuple(truth.position[-1].tolist()),
-        motors_off=int(truth.off_in_air[-1]),
-        landed=on_floor(truth),
-        disarmed=truth.supervisor[-1] not in _ARMED,
-        locked=truth.locked,
-        readable=readable,
-        reason=flown.reason,
-        planner=", ".join(answer.reason or answer.verdict.value for answer in flown.answers),
-    )
-
-
-def to_wall(truth: Truth, space: Space) -> float:
-    """Return the least distance, m, of the true position from walls and ceiling; negative beyond them."""
-    low, high = np.array(space.low), np.array(space.high)
-    low[2] = -np.inf  # the vehicle may touch the floor
-    return float(np.minimum(truth.position - low, high - truth.position).min())
-
-
-def on_floor(truth: Truth) -> bool:
-    """Return whether the vehicle came to rest on the floor with its motors off."""
-    return bool(truth.position[-1, 2] < _DOWN and not truth.motor[-1].any())
-
-
-def _off_plan(flown: SteppedFlight, mission: Mission) -> float:
-    outcome, truth = flown.outcome, flown.truth
-    begin = flown.struck if not math.isnan(flown.struck) else outcome.first_setpoint if outcome is not None else 0.0
-    if outcome is None and (not flown.sent or begin < flown.sent[0][0]):
-        return 0.0
-    if outcome is not None and (not outcome.first_setpoint or begin < outcome.first_setpoint):
-        return 0.0
-    planned = decode(mission.payloads).position
-    after = truth.time >= begin
-    flying = after & (truth.time < flown.landing) & (truth.position[:, 2] > 0.02)
-    down = after & (truth.time >= flown.landing)
-    near = cKDTree(planned).query(truth.position[flying])[0]
-    beside = cKDTree(planned[:, :2]).query(truth.position[down][:, :2])[0]
-    return float(max(near.max(initial=0.0), beside.max(initial=0.0)))
-
-
-def _off_setpoint(flown: SteppedFlight, mission: Mission) -> float:
-    """Return the largest distance, m, from the setpoint of the same moment: lagging along the path counts."""
-    if not flown.sent:
-        return 0.0
-    sent, truth = np.array([time for time, _ in flown.sent]), flown.truth
-    begin = sent[0] if math.isnan(flown.struck) else max(sent[0], flown.struck)
-    during = (truth.time >= begin) & (truth.time <= min(sent[-1], flown.landing))
-    places = np.array([place for _, place in flown.sent])
-    due = truth.time[during] - mission.lead
-    wanted = np.column_stack([np.interp(due, sent, places[:, axis]) for axis in range(3)])
-    return float(np.linalg.norm(truth.position[during] - wanted, axis=1).max(initial=0.0))
-
-
-class _FullDisk:
-    """A file on a disk that is full after the header."""
-
-    def __init__(self, path: Path):
-        self._file = path.open("xb", buffering=0)
-        self._left = 200_000
-
-    def write(self, data: bytes, /) -> int | None:
-        if len(data) > self._left:
-            raise OSError(28, "No space left on device")
-        self._left -= len(data)
-        return self._file.write(data)
-
-    def truncate(self, size: int, /) -> int:
-        return self._file.truncate(size)
-
-    def close(self) -> None:
-        self._file.close()
-
-
-def _header(mission: Mission) -> RecordHeader:
-    path = decode(mission.payloads).position[::5]
-    return header_under(mission.limits, name="fault", uri="stepped://0", path=path, travel_time=mission.motion_ends)
 
 
 STUDY = Study(Settings, work, tables, "flights/line.yaml -o results/faults.json")

@@ -37,13 +37,13 @@ from cfplan.simulation.lab.stepped_fleet import ARMED, FleetFlight, SteppedFleet
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from studies.faults import on_floor, to_wall
 from studies.random_faults import PATIENT
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
 from studies.runner.reductions import count, smallest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import on_floor, to_wall
 
 _MEDIAN_DURATION, _LOG_DURATION_STD = 0.5, 1.0  # of a fault: s, and standard deviation of the logarithm
 _PERMANENT_FRACTION = 0.5  # of the faults that may end

@@ -30,14 +30,13 @@ from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.vehicle.airframe import GRAVITY
 from cfplan.vehicle.rotations import hopf_quaternion
 from cfplan.vehicle.trajectory import Trajectory
-from studies.fault_scenarios import Scenario
-from studies.faults import fly_stepped
 from studies.real_time import Conditions, RealTimeFlight, fly_in_real_time
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
 from studies.runner.reductions import count, largest, mean, rms, total
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import Scenario, fly_stepped
 
 _DRAWN_BY = 7  # seed of the vehicles: others than those of dry runs
 PLAN_COLUMNS = (
@@ -48,7 +47,7 @@ PLAN_COLUMNS = (
     Column("lower_bound"),
     Column("over_bound", "over bound", "%", ".1f", meaning="planned time over the proven lower bound"),
     Column("speed_factor", "speed kept", "%", ".2f", meaning="by repair, of the planner's speed"),
-    Column("worst_share", "worst share", "%", ".2f", meaning="of any limit, by the certificate",
+    Column("worst_usage", "largest usage", "%", ".2f", meaning="of any limit, by the certificate",
            value=largest("worst_usage")),
     Column("dry_run", "dry run", "cm", ".1f", meaning="largest deviation, 95th percentile of drawn vehicles"),
     Column(

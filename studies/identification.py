@@ -31,13 +31,12 @@ from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.cameras import ViconSettings
 from cfplan.vehicle.airframe import Airframe
-from studies.fault_scenarios import Scenario
-from studies.faults import SteppedFlight, fly_stepped
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
 from studies.runner.reductions import count, largest, median
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import Scenario, SteppedFlight, fly_stepped
 
 MASS, THRUST, MOMENT = 0.10, 0.08, 0.30  # largest relative deviation from the nominal values
 LAGS, DRAGS, LATENCIES = (0.06, 0.14), (0.5, 2.0), (0.005, 0.040)  # s, factor, s

@@ -31,13 +31,12 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from studies.fault_scenarios import FOR_GOOD, Scenario
-from studies.faults import FaultFlight, fly_scenario
 from studies.runner.limits import limits_for
 from studies.runner.options import argument, option
 from studies.runner.reductions import count, largest, smallest
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import FOR_GOOD, FaultFlight, Scenario, fly_scenario
 
 _LENGTH, _SPREAD = 0.5, 1.2  # median, s, and standard deviation of the logarithm of a fault's duration
 PATIENT = FlightOptions(budget=60.0)  # so that the plans are the same on a computer with other work

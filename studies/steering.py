@@ -33,13 +33,13 @@ from cfplan.steering.steered_vehicle import SteeredVehicle
 from cfplan.steering.stepped_steering import SteppedSteering
 from cfplan.steering.waypoint_lines import parse_line
 from cfplan.vehicle.joint import JoinedTrajectory
-from studies.faults import on_floor, to_wall
 from studies.flown_sequence import Committed, SequenceVerdict, judge_sequence
 from studies.runner.limits import limits_for
 from studies.runner.options import option
 from studies.runner.reductions import count, largest, mean, smallest, total
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import on_floor, to_wall
 
 _PLANNING = (0.02, 0.05, 0.1, 0.3)  # s, planning times, one of which is drawn for each flight
 _BURST_FRACTION, _BURST, _BURST_PERIOD = 0.02, (10, 30), 0.02  # fraction of bursts, requests in a burst, s between them
@@ -135,7 +135,7 @@ SEQUENCE_COLUMNS = (
     Column("differing", "not as committed", format=".0f", goal="0", value=total("differing")),
     Column("without_stop", "without a stop", format=".0f", goal="0",
            meaning="setpoints without a committed stop that rests inside", value=total("without_stop")),
-    Column("plan_share", "of a limit", "%", ".2f", goal="100 %", meaning="the most, by the dense certificate",
+    Column("plan_usage", "usage of a limit", "%", ".2f", goal="100 %", meaning="the most, by the dense certificate",
            value=largest("plan_usage")),
     Column("speed", "speed", "m/s", ".3f", value=largest("speed")),
     Column("acceleration", "acceleration", "m/s²", ".2f", meaning="by differences of the velocities streamed",

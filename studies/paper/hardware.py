@@ -45,8 +45,6 @@ from cfplan.simulation.geometric_flight import LOST
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.vehicle.trajectory import Trajectory
-from studies.fault_scenarios import FOR_GOOD, Scenario
-from studies.faults import fly_stepped
 from studies.giving_way import random_paths
 from studies.paper.printed import HARDWARE, paper_column
 from studies.paper.sequences import read_sequences
@@ -68,6 +66,7 @@ from studies.runner.options import option
 from studies.runner.reductions import among, count, largest, mean
 from studies.runner.result import Column, Table, table
 from studies.runner.study import Run, Study, Work
+from studies.stepped_flight import FOR_GOOD, Scenario, fly_stepped
 
 DATA = FilePath("datasets/paper-hardware")  # one folder per set of limits, with its dataset and networks
 NOISES = (0.001, 0.01, 0.1)  # m, noise injected in training the LSTMs that the paper flew

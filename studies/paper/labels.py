@@ -93,12 +93,18 @@ def of_same_paths(toppquad: Path, expert: Path) -> dict[Labeller, Sequences]:
     for labeller, sequences in read.items():
         if sequences.spec.planner is not labeller:
             raise InputError(
-                f"labels by {sequences.spec.planner}", where=str(folders[labeller]), hint=f"needed: by {labeller}"
+                f"its labels are by {sequences.spec.planner}",
+                where=str(folders[labeller]),
+                hint=f"give a dataset that was made with --planner {labeller}",
             )
     first, second = read.values()
     first, second = first.part(np.isin(first.rows, second.rows)), second.part(np.isin(second.rows, first.rows))
     if not np.array_equal(first.inputs, second.inputs):
-        raise InputError("the two datasets have other paths", where=str(expert), hint="make both with one seed")
+        raise InputError(
+            f"its paths are not those of {toppquad}",
+            where=str(expert),
+            hint="make both with the same options, except --planner",
+        )
     return dict(zip(read, (first, second), strict=True))
 
 

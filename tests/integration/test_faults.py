@@ -24,11 +24,11 @@ from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaul
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from cfplan.vehicle.airframe import GRAVITY
-from studies.fault_scenarios import ASKED, ASKED_AFTER, FOR_GOOD, SCENARIOS, Scenario
-from studies.faults import STUDY, Settings, fly_scenario, fly_stepped, judge, prepare_timeline
+from studies.faults import ASKED_AFTER, SCENARIOS, STUDY, Settings
 from studies.random_faults import PATIENT, fly_random, prepare_missions, random_scenario, with_silence
 from studies.runner.limits import limits_for
 from studies.runner.study import Run
+from studies.stepped_flight import ASKED, FOR_GOOD, Scenario, fly_scenario, fly_stepped, judge, prepare_timeline
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"

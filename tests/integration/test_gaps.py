@@ -17,8 +17,7 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.draws import draw_vehicles
 from cfplan.simulation.glitches import GAP, glitch_at_every_setpoint, glitch_at_sampled_setpoints
 from cfplan.simulation.lab.stepped_lab import SteppedLab
-from studies.fault_scenarios import Scenario
-from studies.faults import fly_stepped
+from studies.stepped_flight import Scenario, fly_stepped
 
 REPOSITORY = Path(__file__).parents[2]
 LOOP = REPOSITORY / "tests" / "data" / "loop_that_a_gap_loses.npz"

@@ -16,9 +16,8 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from studies.fault_scenarios import FOR_GOOD, Scenario
-from studies.faults import FaultFlight, fly_scenario
 from studies.random_faults import prepare_missions, random_scenario
+from studies.stepped_flight import FOR_GOOD, FaultFlight, Scenario, fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 pytestmark = [pytest.mark.integration, pytest.mark.slow]

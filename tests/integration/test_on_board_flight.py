@@ -24,8 +24,8 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
-from studies.fault_scenarios import FOR_GOOD, SCENARIOS, Scenario
-from studies.faults import fly_scenario
+from studies.faults import SCENARIOS
+from studies.stepped_flight import FOR_GOOD, Scenario, fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 LIMITS = load_limits(REPOSITORY / "safety.yaml")

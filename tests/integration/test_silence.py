@@ -13,8 +13,7 @@ from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
-from studies.fault_scenarios import FOR_GOOD, Scenario
-from studies.faults import fly_scenario
+from studies.stepped_flight import FOR_GOOD, Scenario, fly_scenario
 
 REPOSITORY = Path(__file__).parents[2]
 MOMENTS = {Phase.TAKE_OFF: 0.9, Phase.GO_TO_START: 0.5, Phase.STREAM: 1.5, Phase.HOLD: 0.2, Phase.LAND: 0.3}  # s

@@ -30,8 +30,8 @@ from cfplan.simulation.link_loss import (
 )
 from cfplan.vehicle.airframe import GRAVITY
 from studies.blind_link_loss import measure as lose_link_and_poses
-from studies.fault_scenarios import SCENARIOS
-from studies.faults import fly_stepped
+from studies.faults import SCENARIOS
+from studies.stepped_flight import fly_stepped
 
 REPOSITORY = Path(__file__).parents[2]
 KILLED = next(row for row in SCENARIOS if row.name == "pilot killed")

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from studies.faults import FaultFlight
 from studies.random_faults import STUDY, Settings
+from studies.stepped_flight import FaultFlight
 
 WELL = FaultFlight(
     "radio:dead for 0.94 s", "stream", "none", "land", 0.1, 0.3, 0.1, 0.5, 1.2, (0.0, 0.0, 0.0), 0,

@@ -48,7 +48,7 @@ def test_the_study_flies_the_same_by_the_same_seed(flown):
     by_planner, together = result.table("requests").rows
     assert (by_planner["group"], together["group"]) == (f"{flown[0].planning:g} s", "all")
     assert together["requests"] == flown[0].requests
-    assert result.table("sequence").rows[1]["plan_share"] == flown[0].plan_usage
+    assert result.table("sequence").rows[1]["plan_usage"] == flown[0].plan_usage
     assert result.table("bad").rows == ()
 
 

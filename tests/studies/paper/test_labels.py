@@ -43,9 +43,9 @@ def test_the_paths_are_those_of_both_datasets_and_the_labels_differ(toppquad, ma
 def test_datasets_that_cannot_be_compared_are_refused(toppquad, made, tmp_path):
     expert = made()
     for first, second, text in (
-        (toppquad, made(seed=2), "other paths"),
-        (expert, expert, "labels by expert"),
-        (toppquad, toppquad, "labels by toppquad"),
+        (toppquad, made(seed=2), "its paths are not those of"),
+        (expert, expert, "its labels are by expert"),
+        (toppquad, toppquad, "its labels are by toppquad"),
         (tmp_path / "none", expert, "no such dataset"),
     ):
         with pytest.raises(InputError, match=text):
