@@ -1,6 +1,6 @@
 """Compare an LSTM that learned TOPPQuad's labels, as the paper's did, with one that learned the expert's.
 
-Both are trained with the same options and seed, on the paths that both datasets have solved.
+Both are trained with the same options and seed, each on the paths that its planner solved.
 """
 
 from collections.abc import Iterator
@@ -13,20 +13,18 @@ import numpy as np
 from cfplan.errors import InputError
 from cfplan.learning.dataset import make_dataset
 from cfplan.learning.dataset_spec import Labeller
-from studies.paper.printed import TEST, TRAIN
 from studies.paper.sequences import Sequences, read_sequences
 from studies.paper.trained import (
     DATA,
     DATA_COMMAND,
-    EPOCHS,
-    QUICK,
     QUICK_EPOCHS,
-    QUICK_MOST,
     QUICK_TESTED,
     TESTED,
+    NetworkSettings,
     PaperPath,
     TrainedNetwork,
     identities,
+    paper_data,
     quick_spec,
     trained_networks,
 )
@@ -37,75 +35,57 @@ from studies.runner.result import Table, table
 from studies.runner.study import Run, Study, Work
 
 QUICK_ROWS = QUICK_TESTED + 4  # TOPPQuad takes a second for each
-NAMES = {Labeller.TOPPQUAD: "LSTM, TOPPQuad's labels", Labeller.EXPERT: "LSTM, the expert's labels"}
+TOPPQUAD_COMMAND = DATA_COMMAND.replace(str(DATA), "{folder}") + f" --planner {Labeller.TOPPQUAD}"
+LEARNED_TOPPQUAD, LEARNED_EXPERT = "LSTM, TOPPQuad's labels", "LSTM, the expert's labels"
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
+class Settings(NetworkSettings):
     """The paths to plan, and the labels of the networks that plan them."""
 
-    paths: int = option(100, "Number of training paths, and of test paths.", least=1)
-    toppquad: Path = option(DATA.with_name("paper-toppquad"), "Dataset with TOPPQuad's labels.")
-    expert: Path = option(DATA, "Dataset with the expert's labels of the same paths, or of more.")
-    networks: Path = option(DATA.with_name("labels-networks"), "Folder of the networks; missing ones are trained.")
-    epochs: int | None = option(None, EPOCHS, least=1)
-    quick: bool = option(False, QUICK)
+    toppquad: Path = option(DATA.with_name("paper-toppquad"), "Dataset of the same paths with TOPPQuad's labels.")
 
 
 def work(settings: Settings, run: Run) -> Work:
     """Return one case per path; the networks are trained if necessary.
 
-    Raises InputError if a dataset is missing, the two have not the same paths, or too few.
+    Raises InputError if a dataset is missing or too small, or the two have not the same paths.
     """
+    data, folder, tested, epochs = settings.data, settings.networks, TESTED, settings.epochs
+    toppquad = settings.toppquad
+    expert = paper_data(settings, run, [SequenceOptions()])
     if settings.quick:
-        made = {Labeller.TOPPQUAD: run.scratch / "toppquad", Labeller.EXPERT: run.scratch / "expert"}
-        for labeller, folder in made.items():
-            make_dataset(folder, replace(quick_spec(), count=QUICK_ROWS, planner=labeller))
-        settings = replace(
-            settings, toppquad=made[Labeller.TOPPQUAD], expert=made[Labeller.EXPERT], networks=run.scratch,
-            epochs=QUICK_EPOCHS, paths=min(settings.paths, QUICK_MOST),
-        )  # fmt: skip
-    tested = QUICK_TESTED if settings.quick else TESTED
-    both = of_same_paths(settings.toppquad, settings.expert)
-    networks = []
-    for labeller, sequences in both.items():
-        known, folder = sequences.learned_from(tested), settings.networks / labeller
-        (network,) = trained_networks(known, folder, [SequenceOptions()], run, settings.epochs)
-        networks.append(replace(network, name=NAMES[labeller]))
-    paths = {
-        f"{part} {row}": PaperPath(part, int(row), path)
-        for part, some in ((TRAIN, known), (TEST, sequences.tested(tested)))
-        for row, path in zip(some.rows[: settings.paths], some.paths[: settings.paths], strict=True)
-    }
-    identity = {labeller: asdict(sequences.spec) for labeller, sequences in both.items()}
-    return Work(paths, partial(measure, networks), PaperTrial, identity | {"networks": identities(networks)})
+        data, folder, tested, epochs = run.scratch / "data", run.scratch, QUICK_TESTED, QUICK_EPOCHS
+        toppquad = run.scratch / "toppquad"
+        make_dataset(toppquad, replace(quick_spec(), count=QUICK_ROWS, planner=Labeller.TOPPQUAD))
+    answered = toppquad_answers(toppquad, read_sequences(data))
+    known, options = answered.learned_from(tested), [SequenceOptions()]
+    (learned,) = trained_networks(known, folder / Labeller.TOPPQUAD, options, run, epochs)
+    networks = [replace(learned, name=LEARNED_TOPPQUAD), replace(expert.networks[0], name=LEARNED_EXPERT)]
+    identity = {"data": expert.identity["data"], "toppquad": asdict(answered.spec), "networks": identities(networks)}
+    return Work(expert.paths, partial(measure, networks), PaperTrial, identity)
 
 
-def of_same_paths(toppquad: Path, expert: Path) -> dict[Labeller, Sequences]:
-    """Return the sequences of the paths that both datasets have solved. Raises InputError if their paths differ."""
-    folders = {Labeller.TOPPQUAD: toppquad, Labeller.EXPERT: expert}
-    for labeller, folder in folders.items():
-        if not folder.is_dir():
-            more = f" --planner {labeller}" if labeller is not Labeller.EXPERT else ""
-            command = DATA_COMMAND.replace(str(DATA), str(folder)) + more
-            raise InputError("no such dataset", where=str(folder), hint=f"make it: {command}")
-    read = {labeller: read_sequences(folder) for labeller, folder in folders.items()}
-    for labeller, sequences in read.items():
-        if sequences.spec.planner is not labeller:
-            raise InputError(
-                f"its labels are by {sequences.spec.planner}",
-                where=str(folders[labeller]),
-                hint=f"give a dataset that was made with --planner {labeller}",
-            )
-    first, second = read.values()
-    first, second = first.part(np.isin(first.rows, second.rows)), second.part(np.isin(second.rows, first.rows))
-    if not np.array_equal(first.inputs, second.inputs):
+def toppquad_answers(folder: Path, expert: Sequences) -> Sequences:
+    """Return the dataset with TOPPQuad's labels. Raises InputError if it is none, or not of the expert's paths."""
+    if not folder.is_dir():
+        command = TOPPQUAD_COMMAND.format(folder=folder)
+        raise InputError("no such dataset", where=str(folder), hint=f"make it: {command}")
+    read = read_sequences(folder)
+    if read.spec.planner is not Labeller.TOPPQUAD:
         raise InputError(
-            f"its paths are not those of {toppquad}",
-            where=str(expert),
-            hint="make both with the same options, except --planner",
+            f"its labels are by {read.spec.planner}",
+            where=str(folder),
+            hint=f"give a dataset that was made with --planner {Labeller.TOPPQUAD}",
         )
-    return dict(zip(read, (first, second), strict=True))
+    _, ours, theirs = np.intersect1d(expert.rows, read.rows, return_indices=True)
+    if not len(ours) or not np.array_equal(expert.inputs[ours], read.inputs[theirs]):
+        raise InputError(
+            "its paths are not those with the expert's labels",
+            where=str(folder),
+            hint="make both datasets with the same options, except --planner",
+        )
+    return read
 
 
 def measure(networks: list[TrainedNetwork], asked: PaperPath) -> list[PaperTrial]:
