@@ -95,13 +95,13 @@ def load_plan(file: FilePath | str) -> Plan:
         if metadata["format"] != FORMAT:
             raise InputError(f"a plan of format {metadata['format']}, not {FORMAT}", where=where, hint=_HINT)
         plan = _rebuilt(metadata)
+        _check_samples(plan, table, where)
     except KeyError as error:
         raise InputError(f"not a plan of cfplan: {error} is missing", where=where, hint=_HINT) from None
     except CfplanError as error:
         raise InputError(error.what, where=where, hint=error.hint or _HINT) from None
-    except (ValidationError, ValueError, TypeError, AttributeError, OverflowError) as error:
+    except (ValidationError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise InputError(f"not a sound plan: {_one_line(error)}", where=where, hint=_HINT) from None
-    _check_samples(plan, table, where)
     return plan
 
 

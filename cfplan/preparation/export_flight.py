@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.files.atomic import write_atomically
-from cfplan.files.text import read_table
+from cfplan.files.atomic import atomic_output, write_atomically
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
 from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
@@ -202,12 +201,13 @@ def write_polynomials(exported: ExportedFlight, form: Form, file: Path) -> None:
     if form is not Form.CRAZYSWARM:
         write_atomically(file, exported.on_board.memory)
         return
-    write_atomically(file, polynomial_rows(pieces.durations, pieces.coefficients).encode())
-    read = Pieces(*read_polynomial_rows(file))
-    if not (
-        np.array_equal(read.durations, pieces.durations) and np.array_equal(read.coefficients, pieces.coefficients)
-    ):
-        raise NotCertifiedError("the written file reads back differently", where=str(file), hint="please report this")
+    with atomic_output(file) as unfinished:
+        unfinished.write_bytes(polynomial_rows(pieces.durations, pieces.coefficients).encode())
+        read = Pieces(*read_polynomial_rows(unfinished))
+        if not (
+            np.array_equal(read.durations, pieces.durations) and np.array_equal(read.coefficients, pieces.coefficients)
+        ):
+            raise NotCertifiedError("the file reads back differently", where=str(file), hint="please report this")
 
 
 def write_samples(planned: PlannedFlight, rate: float, file: Path, wait: float = 0.0) -> int:
@@ -225,16 +225,17 @@ def write_samples(planned: PlannedFlight, rate: float, file: Path, wait: float =
         )  # fmt: skip
     rows = sample_rows(trajectory, rate, wait)
     lines = [",".join(f"{value:.{_DIGITS}f}" for value in row) for row in rows.tolist()]
-    write_atomically(file, ("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
-    read, _ = read_table(file, len(COLUMNS), ", ".join(COLUMNS))
-    check_samples(read, trajectory, limits, str(file), wait)
+    with atomic_output(file) as unfinished:
+        unfinished.write_bytes(("\n".join([",".join(COLUMNS), *lines]) + "\n").encode())
+        read = np.loadtxt(unfinished, delimiter=",", skiprows=1, ndmin=2)
+        check_samples(read, trajectory, limits, str(file), wait)
     return len(read)
 
 
 def sample_rows(trajectory: Trajectory, rate: float, wait: float = 0.0) -> NDArray:
     """Return (N, 18): the columns of a file of samples, SI units and rad, the quaternion body to world."""
     end = wait + trajectory.duration
-    times = np.append(np.arange(np.ceil(end * rate)) / rate, end)
+    times = np.round(np.append(np.arange(np.ceil(end * rate)) / rate, end), _DIGITS)
     state = trajectory.at(times - wait)
     return np.column_stack(
         [

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
 from cfplan.flight.setpoints.encoding import encode_trajectory
@@ -16,7 +18,7 @@ from cfplan.planners.baselines.convex import lower_bound
 from cfplan.planners.baselines.point_mass import point_mass_time
 from cfplan.planners.task import PlanningTask
 from cfplan.planning.path.choice import FastestPath, chosen_path
-from cfplan.planning.plan import default_budget, plan
+from cfplan.planning.plan import check_endurance, default_budget, plan
 from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.planning.plan_result import Plan
 from cfplan.planning.planners import AUTO
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLAN_SUFFIX = ".parquet"
+_AT_REST = 1e-3  # m/s and m/s²
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +198,7 @@ def give_way(
     plans are slowed more than necessary, which takes less time.
 
     Raises:
-        InfeasibleError: at some place that happens at any speed.
+        InfeasibleError: at some place that happens at any speed, or the slower flight outlasts the battery.
     """
     limits = planned.limits
 
@@ -219,6 +222,7 @@ def give_way(
         results.details.append(f"a gap {glitches.describe(glitches.worst)} at most")
         if slowed.slowing and deadline.passed:
             results.warn("perhaps more than needed, as the budget of time is spent")
+    check_endurance(slowed.trajectory.duration, limits)
     return slowed, link_loss[0].simulated if link_loss else None
 
 
@@ -238,7 +242,10 @@ def _corrected(planned: PlannedFlight, options: FlightOptions, on_step: OnStep) 
 
 
 def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
-    """Read a plan made under any limits, and certify it under these. Raises InputError if its vehicle is another."""
+    """Read a plan made under any limits, and certify it under these.
+
+    Raises InputError if its vehicle is another or it is not from rest to rest, InfeasibleError if it is too long.
+    """
     with step(on_step, "plan") as results:
         plan = load_plan(file)
         if plan.airframe != limits.airframe:
@@ -247,6 +254,14 @@ def _read_plan(file: Path, limits: Limits, on_step: OnStep) -> PlannedFlight:
                 where=str(file),
                 hint="plan the path again for this vehicle",
             )
+        ends = plan.trajectory.at(np.array([0.0, plan.trajectory.duration]))
+        moving = float(np.abs([ends.velocity, ends.acceleration]).max())
+        if moving > _AT_REST:
+            raise InputError(
+                "it does not begin and end at rest", where=str(file),
+                hint="a plan that was made in the air cannot be flown by itself: plan a path file",
+            )  # fmt: skip
+        check_endurance(plan.trajectory.duration, limits)
         caps = plan.slowing.caps if plan.slowing else None
         certificate = certify(plan.trajectory, limits.plan, limits.space, caps)
         results.append(f"{plan.trajectory.duration:.2f} s, {plan.planner}, read from {file}")

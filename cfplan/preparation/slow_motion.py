@@ -8,6 +8,7 @@ take-offs there. Ways with an obstacle on or below them are left out, as preflig
 begin close to an obstacle: between a wall and an obstacle the vehicle leans away from each towards the other.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
-from cfplan.flight.pilot.mission import Mission, manoeuvre_time
+from cfplan.flight.pilot.mission import Mission, go_to_time, manoeuvre_time
 from cfplan.flight.setpoints.commitment import QUANTUM
 from cfplan.flight.setpoints.descent import descent, gentle
 from cfplan.flight.setpoints.encoding import encode_motion
@@ -82,7 +83,7 @@ def _motions(mission: Mission) -> Iterator[_Motion]:
         begin = (float(place[0]), float(place[1]), height)
         if not (_clear(begin, begin, beside) and _clear(begin, (x, y, z), space)):
             continue
-        duration = manoeuvre_time(float(np.linalg.norm(np.subtract((x, y, z), begin))), ground.go_to_speed)
+        duration = go_to_time(math.dist((x, y, z), begin), _TURN, mission.limits)
         way = _way(begin, (x, y, z), yaw + _TURN, yaw, duration, mission)
         yield f"on the way from {_text(begin)} to the start", _START_HINT, way
     end, end_yaw = mission.end

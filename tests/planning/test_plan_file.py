@@ -171,6 +171,13 @@ def test_a_plan_that_is_at_odds_with_itself_is_refused(saved, tmp_path, change, 
     assert "\n" not in str(error.value)
 
 
+def test_metadata_nested_too_deep_is_refused(saved, tmp_path):
+    table, file = pyarrow.parquet.read_table(saved), tmp_path / "deep.parquet"
+    pyarrow.parquet.write_table(table.replace_schema_metadata({b"cfplan": b"[" * 20_000 + b"]" * 20_000}), file)
+    with pytest.raises(InputError, match="not a sound plan"):
+        load_plan(file)
+
+
 def test_a_file_of_another_kind_is_refused(tmp_path):
     file = tmp_path / "other.parquet"
     pyarrow.parquet.write_table(pyarrow.table({"x": [1.0]}), file)

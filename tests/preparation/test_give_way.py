@@ -64,6 +64,14 @@ def test_the_cost_is_told(path_file, limits, gave_way):
     assert gap.startswith("a gap of 0.2 s in ")
 
 
+def test_a_plan_that_outlasts_the_battery_only_by_giving_way_is_refused(path_file, warned, gave_way, limits):
+    ground, space = limits.ground, limits.space
+    around = (space.high[2] - space.low[2]) * (1.0 / ground.take_off_speed + 1.0 / ground.land_speed)
+    between = 0.5 * (warned.duration + gave_way.duration) + around
+    with pytest.raises(InfeasibleError, match="trusted for"):
+        plan_flight(path_file, replace(limits, battery=replace(limits.battery, endurance=between)))
+
+
 def test_where_safety_yaml_says_to_warn_nothing_is_slowed(warned):
     assert warned.plan.slowing is None
     assert warned.to_dict()["slower_for"] == []

@@ -8,7 +8,7 @@ import pytest
 
 from cfplan.errors import InfeasibleError, InputError, NotCertifiedError
 from cfplan.flight.setpoints.packets import decode
-from cfplan.planning.plan_file import save_plan
+from cfplan.planning.plan_file import load_plan, save_plan
 from cfplan.preparation import glitch_assessment, link_loss_assessment
 from cfplan.preparation import plan_flight as planning
 from cfplan.preparation import prepare_flight as preparation
@@ -17,6 +17,8 @@ from cfplan.preparation.prepare_flight import encode_flight, find_link_loss, pre
 from cfplan.preparation.steps import StepState
 from cfplan.simulation import link_loss
 from cfplan.simulation.link_loss import LinkLoss, simulate_link_loss
+from cfplan.vehicle.profile import SpeedProfile
+from cfplan.vehicle.trajectory import Trajectory
 
 REPOSITORY = Path(__file__).parents[2]
 LINE = REPOSITORY / "flights" / "line.yaml"
@@ -124,6 +126,25 @@ def test_a_plan_of_another_vehicle_is_refused(limits, tmp_path):
     heavier = replace(limits, airframe=replace(limits.airframe, mass=1.1 * limits.airframe.mass))
     with pytest.raises(InputError, match="planned for"):
         prepare_flight(tmp_path / "plan.parquet", heavier)
+
+
+def test_a_plan_that_does_not_begin_and_end_at_rest_is_refused(limits, tmp_path):
+    made = plan_flight(LINE, limits).plan
+    path, at = made.path.part(0.3 * made.path.end, 0.7 * made.path.end), np.linspace(0.0, 1.0, 101)
+    nodes, steps = np.zeros_like(at), np.zeros(len(at) - 1)
+    steady = SpeedProfile(at * path.end, nodes + 0.2, nodes, nodes, steps, nodes, nodes, steps)
+    moving = Trajectory(path, steady, made.airframe)
+    save_plan(replace(made, path=path, trajectory=moving, slowing=None), tmp_path / "moving.parquet")
+    assert load_plan(tmp_path / "moving.parquet").certificate.passed
+    with pytest.raises(InputError, match="at rest"):
+        prepare_flight(tmp_path / "moving.parquet", limits)
+
+
+def test_a_plan_that_outlasts_the_battery_is_refused(limits, tmp_path):
+    save_plan(plan_flight(LINE, limits).plan, tmp_path / "plan.parquet")
+    emptier = replace(limits, battery=replace(limits.battery, endurance=5.0))
+    with pytest.raises(InfeasibleError, match="trusted for 5 s"):
+        plan_flight(tmp_path / "plan.parquet", emptier)
 
 
 def test_a_plan_that_breaks_todays_limits_is_certified_anew_and_not_encoded(limits, tmp_path, steps):

@@ -1,5 +1,6 @@
 """The mission: everything that the pilot needs to know, fixed before the vehicle is armed."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,8 @@ from cfplan.flight.setpoints.stops import encode_stops
 from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import SHORTEST_MANOEUVRE, Limits
 from cfplan.vehicle.rotations import yaw_of
+
+PEAK_RATE, PEAK_CHANGE = 35 / 16, 7.52  # of a polynomial of degree 7 from rest to rest, one unit in one second
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +66,19 @@ def mission_of(encoded: EncodedFlight, limits: Limits, *, hold_time: float = 1.0
 def manoeuvre_time(distance: float, mean_speed: float) -> float:
     """Return the time, s, for a distance, m, from hover to hover."""
     return max(SHORTEST_MANOEUVRE, distance / mean_speed)
+
+
+def go_to_time(distance: float, turn: float, limits: Limits) -> float:
+    """Return the time, s, for the way to a start, m, with a `turn` of yaw, rad, that keeps the limits of plans.
+
+    Both the commander's polynomials of degree 7 and the setpoints', of degree 5, do.
+    """
+    turn, plan = abs(math.remainder(turn, math.tau)), limits.plan
+    return max(
+        manoeuvre_time(distance, limits.ground.go_to_speed),
+        PEAK_RATE * turn / plan.angular_velocity,
+        math.sqrt(PEAK_CHANGE * turn / plan.angular_acceleration),
+    )
 
 
 def _place(payload: NDArray) -> tuple[Triple, float]:

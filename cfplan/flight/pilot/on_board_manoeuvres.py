@@ -20,7 +20,7 @@ from cfplan.flight.pilot.flight_loop import ATTEMPTS, AbortRaised, FlightLoop
 from cfplan.flight.pilot.health import GONE
 from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_confirmed
 from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
-from cfplan.flight.pilot.mission import manoeuvre_time
+from cfplan.flight.pilot.mission import go_to_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.pilot.streamed_manoeuvres import BRAKE_HOLD
@@ -122,7 +122,7 @@ class OnBoardManoeuvres:
         self._history.enter(Phase.GO_TO_START)
         (x, y, z), _, yaw = loop.setpoint_now()
         start = self._program.begin
-        duration = manoeuvre_time(math.dist(loop.pose().position, start[:3]), self._limits.ground.go_to_speed)
+        duration = go_to_time(math.dist(loop.pose().position, start[:3]), start[3] - yaw, self._limits)
         way = self._way((x, y, z, yaw), start, duration)
         self._require(_ask(loop, commands.go_to(*start, duration), lambda: loop.begin(way)), "go to the start")
         assert loop.stream is not None

@@ -11,7 +11,7 @@ from cfplan.flight.pilot.flight_loop import FlightLoop
 from cfplan.flight.pilot.health import Descent
 from cfplan.flight.pilot.landing import Landing, stop_motors
 from cfplan.flight.pilot.manoeuvres import Place, begin_take_off, climb, settle_at
-from cfplan.flight.pilot.mission import manoeuvre_time
+from cfplan.flight.pilot.mission import go_to_time
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
@@ -55,7 +55,7 @@ class StreamedManoeuvres:
         self._history.enter(Phase.GO_TO_START)
         start, yaw = self._mission.start
         (x, y, z), _, yaw_above = loop.setpoint_now()
-        duration = manoeuvre_time(math.dist(loop.pose().position, start), self._limits.ground.go_to_speed)
+        duration = go_to_time(math.dist(loop.pose().position, start), yaw - yaw_above, self._limits)
         way = loop.begin(self._way((x, y, z, yaw_above), (*start, yaw), duration))
         loop.until(lambda: loop.now() > way.end, math.inf)
         settle_at(loop, start)
