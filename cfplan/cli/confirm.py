@@ -21,9 +21,7 @@ if TYPE_CHECKING:
 FIRST_SPEED = 0.3  # speed factor at which a path should be flown first
 
 
-def confirmed(
-    prepared: "Mapping[str, Prepared]", name: str, records: Path, *, yes: bool, speed_factor: float | None
-) -> bool:
+def confirmed(prepared: "Mapping[str, Prepared]", name: str, records: Path, *, yes: bool) -> bool:
     """Return whether to fly: always for virtual vehicles or with --yes, otherwise as the user answers.
 
     `prepared` has the flight of each vehicle by its URI. Raises InputError if standard input is not a terminal.
@@ -32,7 +30,8 @@ def confirmed(
         return True
     for uri, each in prepared.items():
         click.echo(describe(each, uri), err=True)
-    if not flown_before(name, records) and (speed_factor is None or speed_factor > FIRST_SPEED):
+    fast = any(each.planned.plan.speed_factor > FIRST_SPEED for each in prepared.values())
+    if fast and not flown_before(name, records):
         click.echo(
             f"No flight of {name!r} on hardware is in {records}: fly it with --speed {FIRST_SPEED} first.", err=True
         )

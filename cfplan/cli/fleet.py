@@ -2,7 +2,7 @@
 
 import contextlib
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,17 +20,6 @@ def is_fleet(file: Path) -> bool:
     from cfplan.planning.fleet.fleet_file import is_fleet_file
 
     return is_fleet_file(file)
-
-
-def refuse_flight_options(given: Mapping[str, bool]) -> None:
-    """Raise InputError for an option of `fly` that a fleet does not have; `given` says which are given."""
-    for name, is_given in given.items():
-        if is_given:
-            raise InputError(
-                f"fleets do not fly with {name} yet",
-                where=name,
-                hint="leave it out; `uri` and `body` of each vehicle stand in the fleet file",
-            )
 
 
 def refuse_output(output: Path | None) -> None:

@@ -44,7 +44,7 @@ def fly_fleet(
         fleet_file, addresses, limits, choices, on_board=on_board, records=records, on_step=steps, listen=shown.show
     ) as fleet:
         prepared = {each.address.uri: each.prepared for each in fleet.vehicles}
-        if not confirmed(prepared, fleet.plan.name, records, yes=yes, speed_factor=planning["speed_factor"]):
+        if not confirmed(prepared, fleet.plan.name, records, yes=yes):
             return int(ExitCode.ENDED_BY_OPERATOR)
         with contextlib.suppress(CfplanError):  # the outcome has the reason
             fleet.take_off()

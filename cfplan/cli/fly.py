@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 from cfplan.cli import fleet, options
 from cfplan.cli.fly_waypoints import fly_waypoints
@@ -108,14 +107,14 @@ def fly(
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
+    flight_options = options.flight_options(planning, safety_file, path_or_plan)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
-        flight_options = options.flight_options(planning, safety_file, path_or_plan)
-        flight = _preparation(on_board, after, planning, uri)(path_or_plan, limits, flight_options, steps)
-        if not confirmed({uri: flight}, flight.planned.name, records, yes=yes, speed_factor=planning["speed_factor"]):
+        flight = _preparation(on_board, after, uri)(path_or_plan, limits, flight_options, steps)
+        if not confirmed({uri: flight}, flight.planned.name, records, yes=yes):
             return int(ExitCode.ENDED_BY_OPERATOR)
         flown = fly_and_record(flight, path_or_plan, records, vehicle, watched, steps)
     return _print_result(flight, flown, as_json)
@@ -126,20 +125,14 @@ def _fly_fleet(
     *, on_board: bool, yes: bool,
 ) -> int:  # fmt: skip
     """Fly a fleet file. Raises InputError for options that a fleet does not have."""
-    context = click.get_current_context()
-    given = {
-        f"--{name.replace('_', '-')}": context.get_parameter_source(name) is ParameterSource.COMMANDLINE
-        for name in ("uri", "after", "live", "mavlink")
-    }
-    fleet.refuse_flight_options(given)
+    hint = "leave it out; `uri` and `body` of each vehicle stand in the fleet file"
+    options.refuse(("uri", "after", "live", "mavlink"), "fleets do not fly with this option yet", hint)
     with steps.waiting("loading planners and simulator"):
         from cfplan.cli.fleet_flight import fly_fleet
     return fly_fleet(file, safety_file, mocap, records, planning, steps, on_board=on_board, yes=yes)
 
 
-def _preparation(
-    on_board: bool, after: tuple[Path, ...], planning: dict[str, Any], uri: str
-) -> "Callable[..., Prepared]":  # fmt: skip
+def _preparation(on_board: bool, after: tuple[Path, ...], uri: str) -> "Callable[..., Prepared]":
     """Return the function that prepares a flight: streamed or on board, the first of its plan or one after others.
 
     Raises InputError if an option requires a new plan with --after.
@@ -150,20 +143,8 @@ def _preparation(
     prepare: Callable[..., Prepared] = prepare_on_board_flight if on_board else prepare_flight
     if not after:
         return prepare
-    _require_no_new_plan(planning)
+    options.refuse(options.NEW_PLAN, "--after flies the plan of the records", "leave one of them out")
     return partial(_prepare_again, prepare, after, on_board=on_board, uri=uri)
-
-
-def _require_no_new_plan(planning: dict[str, Any]) -> None:
-    """Raise InputError if an option requires another plan than that of the records of --after."""
-    chosen = [f"--{name}" for name in ("nodes", "model") if planning[name] is not None]
-    chosen += ["--speed"] if planning["speed_factor"] is not None else []
-    chosen += ["--planner"] if planning["planner"] != "auto" else []
-    if chosen:
-        raise InputError(
-            f"{chosen[0]} needs a new plan, but --after flies the plan of the records", where="--after",
-            hint="leave one of them out",
-        )  # fmt: skip
 
 
 def _prepare_again(
@@ -199,6 +180,8 @@ def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board:
             where=str(path_or_plan or "cfplan fly"),
             hint="name a path file, or --example figure8, or give --waypoints -",
         )
+    hint = "leave it out; to fly slower, lower `speed` of `plan` in safety.yaml"
+    options.refuse((*options.NEW_PLAN, "budget"), "waypoints received in flight are planned without this option", hint)
     return lines
 
 

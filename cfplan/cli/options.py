@@ -3,11 +3,12 @@
 import errno
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.core import ParameterSource
 
 from cfplan.cli.output import VERBOSE, short_path
 from cfplan.errors import InputError
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from cfplan.safety.limits import Limits
 
 SAFETY_FILE = "safety.yaml"
+NEW_PLAN = ("planner", "model", "nodes", "speed_factor")  # parameters of planning() that determine the plan
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 _EXAMPLE = f"{__name__}.example"
@@ -179,10 +181,23 @@ def _check_records_folder(root: Path) -> None:
         ) from error
 
 
-def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
-    """Return the options of planning() with the folders of models. Raises InputError if there is no such model."""
-    from cfplan.preparation.plan_flight import FlightOptions
+def refuse(names: Collection[str], what: str, hint: str) -> None:
+    """Raise InputError if an option of the command by one of these parameter names is given on the command line."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if (name := parameter.name) in names and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise InputError(what, where=max(parameter.opts, key=len), hint=hint)
 
+
+def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
+    """Return the options of planning() with the folders of models.
+
+    Raises InputError if there is no such model, or for an option that would change the plan of a plan file.
+    """
+    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions
+
+    if path_file.suffix == PLAN_SUFFIX:
+        refuse((*NEW_PLAN, "budget"), "a plan file is flown as it was planned", "plan the path again with this option")
     rest = {name: value for name, value in planning.items() if name != "model"}
     model: Path | None = planning["model"]
     if model is not None and not (model / "card.json").is_file():

@@ -50,10 +50,11 @@ def terminal(monkeypatch):
     return answers
 
 
-def ask(mission, records, uri=RADIO, yes=False, speed_factor=None):
+def ask(mission, records, uri=RADIO, yes=False, speed_factor=1.0):
     lost = simulate_link_loss(mission.payloads, mission.limits)
-    prepared = SimpleNamespace(planned=SimpleNamespace(name="eight", duration=1.0), mission=mission, link_loss=lost)
-    return confirm.confirmed({uri: prepared}, "eight", records, yes=yes, speed_factor=speed_factor)
+    planned = SimpleNamespace(name="eight", duration=1.0, plan=SimpleNamespace(speed_factor=speed_factor))
+    prepared = SimpleNamespace(planned=planned, mission=mission, link_loss=lost)
+    return confirm.confirmed({uri: prepared}, "eight", records, yes=yes)
 
 
 def record(records, folder, exit_code=0, uri=RADIO):

@@ -184,8 +184,8 @@ def test_a_vehicle_whose_name_is_no_file_name_is_refused(cfplan, fleet_file, saf
     ("command", "words", "what"),
     [
         ("plan", ["-o", "a.parquet"], "plan files are not supported"),
-        ("fly", ["--records", ".", "--live"], "do not fly with --live"),
-        ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "do not fly with --uri"),
+        ("fly", ["--records", ".", "--live"], "--live: fleets do not fly with this option"),
+        ("fly", ["--records", ".", "--uri", "radio://0/80/2M/E7E7E7E7E7"], "--uri: fleets do not fly with this option"),
         ("export", ["--to", "memory", "--pieces", "40", "-o", "out"], "holds 31 pieces"),
         ("export", ["--to", "memory", "-o", "line.yaml"], "this is a file"),
         ("export", ["--to", "memory", "-o", "."], "the folder already exists"),

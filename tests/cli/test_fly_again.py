@@ -184,12 +184,20 @@ def test_an_option_that_asks_for_another_flight_is_refused(first, cfplan, option
     ended = cfplan("fly", REPOSITORY / "flights" / "line.yaml", "--after", first[0], *option)
     assert ended.code == 2
     assert "hint:" in ended.err
+    assert option == ("--on-board",) or f"{option[0]}: " in ended.err
 
 
 def test_waypoints_in_the_air_are_no_second_flight(cfplan, tmp_path):
     ended = cfplan("fly", "--waypoints", "-", "--after", tmp_path)
     assert ended.code == 2
     assert "new plan" in ended.err
+
+
+def test_waypoints_in_the_air_refuse_a_speed_that_would_not_hold(cfplan, tmp_path):
+    ended = cfplan("fly", "--waypoints", "-", "--speed", "0.3", "--records", tmp_path)
+    assert ended.code == 2
+    assert "--speed: " in ended.err
+    assert "safety.yaml" in ended.err
 
 
 def test_a_folder_that_is_no_record_is_refused(patched, cfplan, tmp_path):

@@ -1,8 +1,14 @@
 """`cfplan plan`: what it says of a plan compares like with like, in one short line a step."""
 
 import re
+from pathlib import Path
 
 import pytest
+
+from cfplan.preparation.plan_flight import plan_flight
+from cfplan.safety.limits_file import load_limits
+
+REPOSITORY = Path(__file__).parents[2]
 
 
 @pytest.fixture
@@ -55,3 +61,26 @@ def test_the_choice_of_a_fastest_path_is_told_and_bench_and_robustness_make_the_
     assert f"{benched['duration']:.2f}" == chosen["1"]
     perturbed = cfplan("robustness", *files, "--draws", "1", "--epsilon", "0.001", "--json").json
     assert f"{perturbed['flight']:.2f}" == chosen["1"]
+
+
+@pytest.mark.parametrize(
+    "option", [("--speed", "0.3"), ("--planner", "expert"), ("--nodes", "40"), ("--budget", "1"), ("--model", "models")]
+)
+@pytest.mark.parametrize("command", ["plan", "check", "sim", "export", "fly"])
+def test_a_plan_file_is_used_only_as_it_was_planned(cfplan, plan_file, tmp_path, command, option):
+    """With an option that would change its plan, e.g. a lower speed, it must not be flown as if that were not given."""
+    more = {
+        "export": ["--to", "samples", "-o", tmp_path / "a.csv"],
+        "fly": ["--uri", "radio://0/80/2M/E7E7E7E7E7", "--mocap", "vicon://127.0.0.1/cf1", "--records", tmp_path],
+    }
+    ended = cfplan(command, plan_file, "--safety", REPOSITORY / "safety.yaml", *more.get(command, []), *option)
+    assert ended.code == 2
+    assert f"{option[0]}: a plan file is flown as it was planned" in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="module")
+def plan_file(tmp_path_factory):
+    file = tmp_path_factory.mktemp("plan") / "line.parquet"
+    plan_flight(REPOSITORY / "flights" / "line.yaml", load_limits(REPOSITORY / "safety.yaml")).save(file)
+    return file
