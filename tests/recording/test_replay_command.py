@@ -1,6 +1,7 @@
 """Words of `cfplan replay` and of the watchers of `cfplan fly` that cannot be followed: one line, nothing written."""
 
 import json
+import resource
 import shutil
 from pathlib import Path
 
@@ -90,6 +91,19 @@ def test_a_recording_of_reruns_whole_or_cut_off_is_told_where_to_go(flight, tmp_
     error = refused("replay", file, "--save", tmp_path / "b.rrd")
     assert "rerun rrd merge" in error.hint
     assert not (tmp_path / "b.rrd").exists()
+
+
+def test_a_recording_that_does_not_fit_on_the_disk_leaves_the_old_file(flight, tmp_path):
+    file = tmp_path / "a.rrd"
+    file.write_text("mine")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))  # bytes; writing more fails as on a full disk
+    try:
+        error = refused("replay", flight.folder, "--save", file, "--force")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert error.where == str(file)
+    assert [kept.read_text() for kept in tmp_path.iterdir()] == ["mine"]
 
 
 def test_a_truncated_record_is_drawn_as_far_as_it_goes_and_said(flight, tmp_path):

@@ -11,7 +11,7 @@ import rerun.blueprint as rrb
 import rerun_cli
 
 from cfplan.errors import InputError
-from cfplan.files.atomic import atomic_output, check_new_file
+from cfplan.files.atomic import check_new_file, write_atomically
 
 APPLICATION = "cfplan"
 Draw = Callable[[rr.RecordingStream], None]
@@ -20,14 +20,12 @@ Draw = Callable[[rr.RecordingStream], None]
 def save(file: Path, blueprint: rrb.Blueprint, draw: Draw, *, overwrite: bool = False) -> None:
     """Write what `draw` sends, with its blueprint, atomically. Raises InputError if the file cannot be written."""
     check_new_file(file, overwrite=overwrite)
-    with atomic_output(file) as unfinished:
-        unfinished.touch()
-        with rr.RecordingStream(APPLICATION) as stream:
-            stream.save(unfinished)
-            lay_out(stream, blueprint)
-            draw(stream)
-            stream.flush()
-            stream.disconnect()
+    with rr.RecordingStream(APPLICATION) as stream:
+        recording = stream.memory_recording()  # stream.save() would not report a full disk
+        lay_out(stream, blueprint)
+        draw(stream)
+        content = recording.drain_as_bytes()
+    write_atomically(file, content)
 
 
 def open_viewer(blueprint: rrb.Blueprint, draw: Draw) -> None:
