@@ -5,11 +5,11 @@ import gc
 import math
 import multiprocessing
 import signal
-import time
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from cfplan.flight.clock import monotonic
 from cfplan.flight.pilot.deadlines import Deadlines
 from cfplan.flight.real_time import shorten_time_slice, use_fifo_scheduling
 
@@ -41,7 +41,7 @@ class Sleeper:
         self._connection.send((_WATCH, process))
 
     def late(self, begin: float = -math.inf, end: float = math.inf) -> list[float]:
-        """Return the wake-up latency, s, of every deadline in [begin, end], by time.monotonic()."""
+        """Return the wake-up latency, s, of every deadline in [begin, end], by the flight's clock."""
         return [late for _, late in self._ask(_LATE, begin, end)]
 
     def queued(self, begin: float, end: float) -> list[float]:
@@ -67,7 +67,7 @@ def _sleep(connection: Connection, rate: float, first: bool) -> None:
     gc.freeze()
     while True:
         due = deadlines.wait()
-        noted[_LATE].append((due, time.monotonic() - due))
+        noted[_LATE].append((due, monotonic() - due))
         if watched is not None:
             with contextlib.suppress(OSError):  # the process has ended
                 noted[_QUEUED].append((due, int(watched.read_text(encoding="ascii").split()[1]) / 1e9))

@@ -13,9 +13,6 @@ LAYERS = ("flight", "simulation", "recording")
 READ_REAL_TIME = {
     "flight/clock.py": "it is the clock",
     "flight/mocap/child.py": "the driver's process",
-    "flight/mocap/datastream_client.py": "in the driver's process",
-    "flight/mocap/sdk.py": "in the driver's process",
-    "flight/mocap/feed.py": "looks after the driver's process",
     "simulation/lab/sim_driver.py": "in cflib's threads",
     "simulation/dry_run.py": "tells how long it took",
     "recording/rerun/picture.py": "waits for the viewer's process",

@@ -1,4 +1,4 @@
-"""Telemetry of the pilot: small frozen messages on the clock of time.monotonic()."""
+"""Telemetry of the pilot: small frozen messages on the flight's clock."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -61,7 +61,7 @@ class RecordHeader:
     travel_time: float  # s, planned
     path: NDArray  # (M, 3) m, samples for drawing and for the distance to the path
     fence: tuple[Triple, Triple]  # m, lower and upper corner
-    wall_time_at_zero: float  # s since 1970, when time.monotonic() was zero
+    wall_time_at_zero: float  # s since 1970, when the flight's clock was at zero
     provenance: Mapping[str, str] = field(default_factory=dict)
     """Origin of the plan: file, model hash, …"""
     obstacles: tuple[Obstacle, ...] = ()

@@ -138,7 +138,7 @@ _NO_ANSWERS = Answers(*[_NONE] * 8)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """A recorded flight; times are those of time.monotonic() on the machine that flew it."""
+    """A recorded flight; times are those of the flight's clock, cfplan.flight.clock."""
 
     folder: Path
     header: RecordHeader

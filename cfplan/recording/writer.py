@@ -20,7 +20,7 @@ from mcap.writer import CompressionType, Writer
 
 from cfplan.errors import InputError
 from cfplan.files.atomic import atomic_write
-from cfplan.flight.clock import REAL_CLOCK, Clock
+from cfplan.flight.clock import REAL_CLOCK, Clock, monotonic
 from cfplan.flight.telemetry import Telemetry
 from cfplan.recording.header import RecordHeader, header_to_json
 from cfplan.recording.public_topics import PublicTopics
@@ -45,8 +45,8 @@ def new_file(path: Path) -> RawFile:
 
 
 def wall_time_at_zero() -> float:
-    """Return s since 1970 when time.monotonic() was zero, for the header."""
-    return time.time() - time.monotonic()
+    """Return s since 1970 when the flight's clock was at zero, for the header."""
+    return time.time() - monotonic()
 
 
 def new_record_folder(root: Path, name: str, *, now: datetime | None = None) -> Path:

@@ -4,7 +4,6 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from cfplan.errors import ExitCode
+from cfplan.flight.clock import monotonic
 from cfplan.flight.mocap.source import pose_source
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.process import fly
@@ -96,7 +96,7 @@ def test_a_fault_in_real_time_comes_to_its_rung_and_the_vehicle_to_the_ground(ro
             if isinstance(message, Event):
                 said.append(message.text)
             if isinstance(message, SetpointSent) and message.index >= AT and not struck:
-                struck.append(time.monotonic())
+                struck.append(monotonic())
                 act(lab)
 
         outcome = fly(

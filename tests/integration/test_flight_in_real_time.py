@@ -15,6 +15,7 @@ import pytest
 from stepped_flight import at_setpoint
 
 from cfplan.errors import ExitCode
+from cfplan.flight.clock import monotonic
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.setpoints.packets import decode
 from cfplan.flight.telemetry import Estimate, Phase, PoseReceived, SetpointSent, VehicleStatus
@@ -79,7 +80,7 @@ def test_ctrl_c_at_full_speed_lands_and_twice_cuts_the_motors(limits, fly_in, ti
     handler, pressed = signal.getsignal(signal.SIGINT), []
 
     def press() -> None:
-        pressed.append(time.monotonic())
+        pressed.append(monotonic())
         for _ in range(times):
             interrupt()
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cfplan.flight.clock import monotonic
 from studies.sleeper import Sleeper
 
 pytestmark = pytest.mark.slow
@@ -19,14 +20,14 @@ def test_a_sleeper_notes_its_deadlines_and_how_long_a_process_waits_for_its_proc
     busy = "import time; end = time.monotonic() + 1.5\nwhile time.monotonic() < end: pass"
     commands = [[sys.executable, "-c", f"import os; os.sched_setaffinity(0, {processor})\n{busy}"]] * 2
     with Sleeper(100.0, first=False) as sleeper:
-        begin = time.monotonic()
+        begin = monotonic()
         time.sleep(0.2)
         assert 15 <= len(sleeper.late(begin, begin + 0.2)) <= 20
         first, second = (subprocess.Popen(command) for command in commands)  # both on one processor
         sleeper.watch(first.pid)
-        begin = time.monotonic() + 0.4
+        begin = monotonic() + 0.4
         time.sleep(1.0)
-        end = time.monotonic()
+        end = monotonic()
         first.wait()
         second.wait()
         waited = sum(sleeper.queued(begin, end))

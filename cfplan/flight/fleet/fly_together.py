@@ -49,7 +49,7 @@ class FleetOutcome:
     outcomes: dict[str, FlightOutcome]  # of pilots that ended in order
     ends: dict[str, FlightEnded]
     brakes: str  # why the conductor let all brake; empty where it did not
-    begins: float  # s on the clock of time.monotonic(), when the fleet's clock was at 0; infinity where it never was
+    begins: float  # s on the flight's clock, when the fleet's clock was at 0; infinity where it never was
     nearest: float  # m between the columns of two vehicles in the air, as measured
 
     @property

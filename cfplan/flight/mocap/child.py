@@ -148,6 +148,7 @@ def _take_priority() -> None:
 def main() -> None:
     """Run `python -m cfplan.flight.mocap.child FD URI SUBJECT AGAIN`: frames go to FD; SUBJECT "" means every body."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent process
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the parent process lands first, and then ends this one
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     descriptor, text, subject, again = sys.argv[1:]
     outlet = Outlet(int(descriptor), subject)

@@ -6,9 +6,9 @@ and an error as soon as the server goes away.
 
 import socket
 import struct
-import time
 
 from cfplan.errors import InputError, LinkError
+from cfplan.flight.clock import monotonic
 from cfplan.flight.mocap.datastream import (
     LARGEST_PACKET,
     OBJECTS,
@@ -58,7 +58,7 @@ class DataStreamClient:
         """Wait for the next frame and return it."""
         while True:
             body = self._packet()
-            received = time.monotonic()
+            received = monotonic()
             try:
                 frame = self._decoder.frame(body, received)
             except MalformedError as why:

@@ -6,10 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from typing import Self
 
 from cfplan.errors import CfplanError, LinkError
+from cfplan.flight.clock import monotonic
 from cfplan.flight.mocap.child import CONNECT_ALARM, FRAME_ALARM, Message, decoded
 from cfplan.flight.mocap.frames import DriverStage
 from cfplan.flight.mocap.uri import MocapUri
@@ -53,7 +53,7 @@ class Feed:
             try:
                 while data := os.read(self._descriptor, _CHUNK):
                     self._buffer += data
-                    self._heard = time.monotonic()
+                    self._heard = monotonic()
             except BlockingIOError:
                 pass
             found = decoded(self._buffer)
@@ -123,7 +123,7 @@ class Feed:
             os.close(writing)
         with self._lock:
             self._process, self._descriptor, self._buffer = process, reading, bytearray()
-            self._heard = time.monotonic()
+            self._heard = monotonic()
 
     def _end_child(self) -> None:
         with self._lock:
@@ -150,7 +150,7 @@ class Feed:
 
     def _is_silent(self) -> bool:
         """Return whether the child has sent nothing for long; what has not been read yet counts as sent."""
-        if time.monotonic() - self._heard < _LONGEST_SILENCE:
+        if monotonic() - self._heard < _LONGEST_SILENCE:
             return False
         return not select.select([self._descriptor], [], [], 0)[0]
 

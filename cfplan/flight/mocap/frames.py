@@ -21,7 +21,7 @@ class TrackedBody:
 class Frame:
     """One frame of the cameras."""
 
-    received: float  # s on the clock of time.monotonic(), when it reached this computer
+    received: float  # s on the flight's clock, when it reached this computer
     bodies: tuple[TrackedBody, ...]  # bodies that were seen
     hidden: tuple[str, ...] = ()  # known bodies that were not seen
     number: int | None = None  # in the system's own count, if it has one

@@ -8,7 +8,7 @@ from typing import Protocol
 class Pose:
     """A measured pose of the vehicle."""
 
-    time: float  # s on the clock of time.monotonic(), when it was measured (the source's latency is subtracted)
+    time: float  # s on the flight's clock, when it was measured (the source's latency is subtracted)
     received: float  # s, when it reached this process
     position: tuple[float, float, float]  # m
     quaternion: tuple[float, float, float, float]  # body→world, x y z w

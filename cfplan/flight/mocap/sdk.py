@@ -6,12 +6,12 @@ only in a process that can be killed, and checks in advance what it can.
 """
 
 import math
-import time
 from contextlib import suppress
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 from cfplan.errors import InputError, LinkError
+from cfplan.flight.clock import monotonic
 from cfplan.flight.mocap.datastream_client import DataStreamClient, address_of, open_connection
 from cfplan.flight.mocap.frames import Frame, Scene, TrackedBody
 from cfplan.flight.mocap.uri import MocapUri
@@ -70,7 +70,7 @@ class SdkDriver:
             raise LinkError("the stream is closed", where=str(self._uri), hint="connect again")
         try:
             self._client.waitForNextFrame()
-            received = time.monotonic()
+            received = monotonic()
             seen = self._client.rigidBodies
         except RuntimeError as why:
             raise LinkError(str(why), where=str(self._uri), hint="is the system still running there?") from why
@@ -109,9 +109,9 @@ class SdkDriver:
         client = DataStreamClient(self._uri.host, self._uri.port, str(self._uri))
         try:
             client.connect()
-            end = time.monotonic() + _SCENE_TIMEOUT
+            end = monotonic() + _SCENE_TIMEOUT
             with suppress(LinkError):  # a dialect that only the vendor's client understands
-                while time.monotonic() < end and client.scene() is None:
+                while monotonic() < end and client.scene() is None:
                     client.wait()
             return client.scene()
         finally:

@@ -26,7 +26,7 @@ FALLEN = 0.15  # m; a vehicle on the floor that is farther below its setpoint ha
 
 @dataclass(slots=True)
 class Observation:
-    """The pilot's observations at one moment, in s on the clock of time.monotonic(), m, and radians."""
+    """The pilot's observations at one moment, in s on the flight's clock, m, and radians."""
 
     now: float  # s
     pose: Pose | None = None  # the last good one

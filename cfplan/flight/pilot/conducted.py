@@ -21,7 +21,7 @@ CONDUCTOR_SILENT = 1.0  # s without a message of the conductor, which sends twen
 class ConductorMessage:
     """All that the conductor has told a vehicle so far; each message replaces the one before."""
 
-    cleared: Mapping[Phase, float]  # when each phase may begin, s on the clock of time.monotonic()
+    cleared: Mapping[Phase, float]  # when each phase may begin, s on the flight's clock
     brakes: str = ""  # why the fleet brakes; empty while it flies
 
 

@@ -67,7 +67,7 @@ class FlightOutcome:
     reason: str  # one line
     rung: Rung  # how far down the abort ladder it went
     checks: tuple[Check, ...]  # the checks of preflight up to the last one that was made
-    phases: tuple[tuple[Phase, float], ...]  # each phase entered, with its time on the clock of time.monotonic()
+    phases: tuple[tuple[Phase, float], ...]  # each phase entered, with its time on the flight's clock
     first_setpoint: float  # s on the same clock; 0 if none was sent
     flown: float  # s, from the first setpoint to the last that moved
     lateness: Lateness

@@ -23,7 +23,7 @@ class ProposalSource(Protocol):
     """A planner as the pilot sees it."""
 
     def begin(self, start: float) -> None:
-        """Tell the planner that setpoint 0 is due at `start`, s on the clock of time.monotonic(). Must not wait."""
+        """Tell the planner that setpoint 0 is due at `start`, s on the flight's clock. Must not wait."""
 
     def wait(self, patience: float) -> bool:
         """Wait for a proposal, at most for `patience`, s; return whether there is one, or False at once if none

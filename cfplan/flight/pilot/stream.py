@@ -17,7 +17,7 @@ State = tuple[Triple, Triple, Triple, Quaternion, Triple]
 class Stream:
     """Setpoints at a fixed rate from a start time; before it the first one, after the end the last one.
 
-    `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the clock of time.monotonic();
+    `payloads` (N, 29) uint8, the last of them at rest; `rate` in Hz; `start` in s on the flight's clock;
     `stop_from` returns (M, 29) uint8, a stop from one of the setpoints; None for a stop and a descent.
     Setpoints have numbers, from `first` to `last`; number 0 is due at the start. Everything slow is done when the
     stream is made. If the vehicle flies `on_board`, nothing is sent: the setpoints describe its planned motion.
