@@ -1,6 +1,8 @@
 """The command line: one small file per command, wiring only. Heavy packages are imported inside the commands."""
 
 import gc
+import io
+import os
 import signal
 import sys
 
@@ -15,7 +17,7 @@ from cfplan.cli.fly import fly
 from cfplan.cli.identify import identify
 from cfplan.cli.init import init
 from cfplan.cli.mocap import mocap
-from cfplan.cli.output import print_error
+from cfplan.cli.output import print_error, print_json
 from cfplan.cli.plan import plan
 from cfplan.cli.replay import replay
 from cfplan.cli.report import report
@@ -24,7 +26,7 @@ from cfplan.cli.sim import sim
 from cfplan.cli.train import train
 from cfplan.cli.validate import validate
 from cfplan.cli.virtual import virtual
-from cfplan.errors import CfplanError
+from cfplan.errors import CfplanError, InputError
 from cfplan.version import __version__
 
 EPILOG = """\b
@@ -88,6 +90,8 @@ def main() -> None:
     Collecting the thousands of objects that imports create takes a third of a short command's time.
     """
     gc.set_threshold(50_000, 20, 20)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # of characters that a terminal's encoding does not have
     try:
         run_command()
     finally:
@@ -109,14 +113,39 @@ def _exit_code() -> int:
         return ending.exit_code
     except click.ClickException as error:
         error.show()
-        return error.exit_code
+        return _with_document(error.exit_code, error.format_message(), hint="--help lists commands and options")
     except (click.Abort, KeyboardInterrupt):
         print("stopped", file=sys.stderr)
-        return 130
+        return _with_document(130, "stopped")
     except BrokenPipeError:  # the reader of the output has exited, as `| head` does
         sys.stderr.close()
         return 0
+    except OSError as error:
+        return _report(_unusable(error))
     except CfplanError as error:
-        print_error(error, as_json="--json" in sys.argv)
-        return int(error.exit_code)
+        return _report(error)
     return result if isinstance(result, int) else 0
+
+
+def _unusable(error: OSError) -> InputError:
+    """Return the error of a file that is not read or written by a function that names it."""
+    subject, where = ("", str(error.filename)) if error.filename else ("a file, or the output, ", "")
+    hint = "check its name, its permissions, the space on its disk, and that the working folder still exists"
+    return InputError(f"{subject}cannot be used ({error.strerror or error})", where=where, hint=hint)
+
+
+def _report(error: CfplanError) -> int:
+    """Print an error, and return its exit code."""
+    print_error(error)
+    return _with_document(int(error.exit_code), error.what, where=error.where, hint=error.hint)
+
+
+def _with_document(exit_code: int, what: str, *, where: str = "", hint: str = "") -> int:
+    """Return the exit code of an error, which with --json is printed as a document too, if the output can be used."""
+    try:
+        if "--json" in sys.argv:
+            print_json({"error": what, "where": where, "hint": hint, "exit_code": exit_code})
+        print(end="", flush=True)
+    except OSError:  # as of a full disk; what is left to write would fail again at exit, and change the exit code
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return exit_code

@@ -131,17 +131,13 @@ class _WaitingNote:
 
 
 def print_json(document: Any) -> None:
-    """Print one document on standard output; numbers that are not finite become null."""
-    text = json.dumps(json_value(document), indent=2, ensure_ascii=False)
-    click.echo(text.encode("utf-8", "backslashreplace").decode("utf-8"))  # half a surrogate pair, as JSON escapes it
+    """Print one document on standard output, in ASCII; numbers that are not finite become null."""
+    click.echo(json.dumps(json_value(document), indent=2))
 
 
-def print_error(error: CfplanError, *, as_json: bool) -> None:
-    """Print one line on standard error, and with `as_json` the same as JSON on standard output."""
+def print_error(error: CfplanError) -> None:
+    """Print one line on standard error."""
     click.echo(f"{styled('error:', 'red')} {error}", err=True)
-    if as_json:
-        code = int(error.exit_code)
-        print_json({"error": error.what, "where": error.where, "hint": error.hint, "exit_code": code})
 
 
 def print_table(title: str, columns: list[str], rows: Sequence[Sequence[str]]) -> None:

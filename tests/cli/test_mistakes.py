@@ -4,6 +4,9 @@ docs/mistakes.md shows the line of each; its computed numbers may round differen
 """
 
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -151,3 +154,57 @@ def test_an_error_is_a_document_where_json_is_asked_for(cfplan, folder, path_fil
     assert ended.code == ended.json["exit_code"] == 2
     assert ended.json["error"]
     assert ended.json["where"].endswith("path.yaml:1:12")
+
+
+@pytest.mark.parametrize("words", [("fyl",), ("plan", "--sped", "0.5"), ("plan",), ("plan", "a.yaml", "--nodes", "x")])
+def test_a_mistyped_command_is_a_document_too(cfplan, words):
+    ended = cfplan(*words, "--json")
+    assert ended.code == ended.json["exit_code"] == 2
+    assert ended.json["error"] in ended.err
+    assert ended.json["hint"]
+
+
+def test_an_interrupted_command_ends_with_a_document(cfplan, folder, monkeypatch):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cfplan.safety.limits_file.load_limits", interrupt)
+    ended = cfplan("check", "path.yaml", "--json")
+    assert ended.code == ended.json["exit_code"] == 130
+
+
+def test_a_file_that_the_system_refuses_is_named(cfplan, folder):
+    name = 300 * "a" + ".yaml"  # too long
+    ended = cfplan("check", name, "--json")
+    assert ended.code == ended.json["exit_code"] == 2
+    assert ended.json["where"] == name
+    assert ended.json["hint"]
+
+
+def run_in_shell(line):
+    command = [sys.executable, "-c", "from cfplan.cli import main; main()"]
+    line = line.replace("cfplan", shlex.join(command))
+    return subprocess.run(["sh", "-c", line], capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("json", ["", "--json"])
+@pytest.mark.parametrize(
+    "line",
+    [
+        "cfplan init lab {} > /dev/full",
+        "mkdir gone; cd gone; rmdir ../gone; cfplan plan path.yaml --safety ../safety.yaml -o a.parquet {}",
+    ],
+    ids=["a full disk", "a deleted folder"],
+)
+def test_what_the_system_refuses_is_one_line(folder, line, json):
+    ended = run_in_shell(line.format(json))
+    (error,) = ended.stderr.splitlines()
+    assert error.startswith("error: ")
+    assert "hint: " in error
+    assert ended.returncode == 2
+
+
+def test_a_terminal_of_few_characters_is_no_error(folder):
+    ended = run_in_shell("PYTHONIOENCODING=latin-1 cfplan init lab")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "? write" in ended.stdout
