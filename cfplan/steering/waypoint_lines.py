@@ -209,8 +209,8 @@ class QueuedLines:
         while self._orders:
             yield self._orders.popleft()
 
-    def take(self, content: bytes, reply: Callable[[str], None]) -> None:
-        """Take a line; empty lines and remarks are skipped."""
+    def take(self, content: bytes, reply: Callable[[str], None], *, fragment: bool = False) -> None:
+        """Take a line; empty lines and remarks are skipped, and a fragment is refused unless it is an order."""
         text = content.decode("utf-8", "replace")
         if not text.strip() or text.lstrip().startswith("#"):
             return
@@ -224,13 +224,16 @@ class QueuedLines:
         if len(content) >= MAX_LINE_BYTES:
             line.answer(f"refused: longer than {MAX_LINE_BYTES} bytes")
             return
+        if fragment:
+            line.answer("refused: no newline at its end")
+            return
         try:
             self._queue.put_nowait(line)
         except queue.Full:
             line.answer(f"refused: {MAX_WAITING} lines wait already")
 
-    def read(self, stream: IO[bytes], reply: Callable[[str], None]) -> None:
-        """Take a stream's lines until it ends or breaks."""
+    def read(self, stream: IO[bytes], reply: Callable[[str], None], *, fragments: bool) -> None:
+        """Take a stream's lines until it ends or breaks; `fragments`: whether the last one may lack its newline."""
         with contextlib.suppress(OSError, ValueError):
             while line := stream.readline(MAX_LINE_BYTES):
                 rest = line
@@ -238,7 +241,7 @@ class QueuedLines:
                     b"\n"
                 ):  # skip the rest of a line that is too long
                     rest = stream.readline(MAX_LINE_BYTES)
-                self.take(line, reply)
+                self.take(line, reply, fragment=not fragments and not rest.endswith(b"\n"))
 
     def end(self) -> None:
         """Mark the end of the lines."""
@@ -258,7 +261,7 @@ def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLin
 
         def read() -> None:
             try:
-                lines.read(sys.stdin.buffer, reply)
+                lines.read(sys.stdin.buffer, reply, fragments=True)
             finally:
                 lines.end()
 
@@ -358,6 +361,6 @@ def _attend(client: socket.socket, lines: QueuedLines, busy: threading.Lock) -> 
 
     try:
         with client, client.makefile("rb") as stream:
-            lines.read(stream, reply)
+            lines.read(stream, reply, fragments=False)
     finally:
         busy.release()

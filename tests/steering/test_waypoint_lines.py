@@ -244,6 +244,24 @@ def test_a_line_that_is_too_long_is_refused_whole_and_the_next_one_counts(place)
         assert client.recv(100) == f"1 refused: longer than {MAX_LINE_BYTES} bytes\n".encode()
 
 
+@pytest.mark.parametrize("ends", [socket.socket.close, lambda client: client.shutdown(socket.SHUT_WR)])
+def test_the_fragment_of_a_client_that_dies_within_a_line_is_not_flown(place, ends):
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"0 1 1\nreplace 1 0 1.2  0 1 1")
+        ends(client)
+        assert lines.next(60.0).text == "0 1 1\n"
+        assert lines.next(0.5) is None
+        if client.fileno() >= 0:
+            assert client.recv(100).startswith(b"2 refused: no newline")
+
+
+def test_an_order_needs_no_newline(place):
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"land")
+        client.close()
+        assert until(lambda: lines.ending)
+
+
 def test_nobody_else_may_connect_and_no_port_is_open(place):
     before = os.umask(0)
     try:
