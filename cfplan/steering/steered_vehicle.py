@@ -138,9 +138,7 @@ class SteeredVehicle:
             raise InputError("it has taken off already", where="take_off", hint="connect again for another flight")
         limits = self._limits
         if height is not None:
-            if not (np.isreal(height) and math.isfinite(height)):
-                raise InputError(f"{height!r} is not a height", where="take_off", hint="give metres above the origin")
-            limits = replace(limits, ground=replace(limits.ground, take_off_height=float(height)))
+            limits = replace(limits, ground=replace(limits.ground, take_off_height=_checked_height(height)))
         (x, y, _), yaw = self._flight.first_pose()
         timeline = hold_hover((x, y, limits.ground.take_off_height), yaw, limits)
         mission = Mission(timeline.commitment.payloads, timeline.commitment.stops, limits)
@@ -191,23 +189,24 @@ class SteeredVehicle:
         """Undo one `slower`. Otherwise like `replace`."""
         return self.ask(Wish.FASTER)
 
-    def ask(self, wish: Wish, waypoints: ArrayLike = ()) -> PathAnswer:
+    def ask(self, wish: Wish | str, waypoints: ArrayLike = ()) -> PathAnswer:
         """Request a change, wait for its answer, and return it. Raises like `replace`."""
         answer = self.answer_to(self.request(wish, waypoints))
         if answer.verdict is not PathVerdict.ACCEPTED:
             raise RequestRefusedError(
-                answer_text(answer), where=wish.value, hint="ask for something else; the flight goes on as it was"
+                answer_text(answer), where=str(wish), hint="ask for something else; the flight goes on as it was"
             )
         return answer
 
-    def request(self, wish: Wish, waypoints: ArrayLike = ()) -> int:
+    def request(self, wish: Wish | str, waypoints: ArrayLike = ()) -> int:
         """Request a change and return the number of its answer, without waiting for the answer.
 
         The latest request wins: one that waits to be planned is superseded. If many requests are unread, this waits
-        until the planner has read some. Raises InputError for invalid waypoints, and RequestRefusedError if the planner
-        reads none for 15 s.
+        until the planner has read some. Raises InputError for an invalid wish or waypoints, and RequestRefusedError if
+        the planner reads none for 15 s.
         """
         self._require_flying()
+        wish = _checked_wish(wish)
         points = checked_waypoints(waypoints) if wish in (Wish.EXTEND, Wish.REPLACE) else ()
         number = self._flight.ask(wish, points)
         self._asked.add(number)
@@ -216,7 +215,12 @@ class SteeredVehicle:
         return number
 
     def answer_to(self, number: int) -> PathAnswer:
-        """Wait for the answer to a request and return it; if the planner does not answer, one that says so."""
+        """Wait for the answer to a request and return it; if the planner does not answer, one that says so.
+
+        Raises InputError if `request` has not returned this number.
+        """
+        if not isinstance(number, (int, np.integer)) or number not in self._asked:
+            raise InputError(f"no request {number!r}", where="answer_to", hint="give a number that request() returned")
         self._flight.wait(lambda: number in self._answers, PLANNER_ANSWER_TIMEOUT)
         answer = self._answers.get(number)
         if answer is None:
@@ -355,6 +359,8 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
     hint = "give rows of x, y, z in metres, as [[1, 0, 1], [0, 1, 1.2]]"
     try:
         points = np.array(waypoints, dtype=float)
+    except OverflowError:
+        raise InputError("one of the numbers is too large", where="waypoints", hint=hint) from None
     except (TypeError, ValueError):
         raise InputError("these are not numbers", where="waypoints", hint=hint) from None
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
@@ -372,6 +378,26 @@ def checked_waypoints(waypoints: ArrayLike) -> tuple[Triple, ...]:
             hint="give metres in the frame of the room",
         )
     return tuple((x, y, z) for x, y, z in points.tolist())
+
+
+def _checked_wish(wish: Wish | str) -> Wish:
+    """Return a wish, also of its text. Raises InputError if it is none."""
+    try:
+        return Wish(wish)
+    except ValueError:
+        hint = f"give a cfplan.Wish, or one of {', '.join(Wish)}"
+        raise InputError(f"{wish!r} is not a wish", where="request", hint=hint) from None
+
+
+def _checked_height(height: float) -> float:
+    """Return a height as a number, m. Raises InputError if it is not a finite one."""
+    try:
+        number = float(height) if np.isreal(height) else math.nan
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError("the height is not a finite number", where="take_off", hint="give metres above the origin")
+    return number
 
 
 def _not_flying() -> InputError:

@@ -102,6 +102,7 @@ def test_each_plan_goes_through_its_waypoints_without_a_stop_between(flown, limi
         ([["a", 1, 2]], InputError, "not numbers"),
         ([[np.nan, 0, 1]], InputError, "waypoint 1"),
         ([[1e300, 0, 1]], InputError, "waypoint 1"),
+        ([[10**400, 0, 1]], InputError, "too large"),
         ([1, 2, 3], InputError, "rows of x, y, z"),
         ([], InputError, "rows of x, y, z"),
         (np.ones((1000, 3)), InputError, "at most 200"),
@@ -116,6 +117,31 @@ def test_what_cannot_be_flown_is_refused_in_words_and_the_flight_goes_on(flown, 
     assert np.linalg.norm(np.subtract(vehicle.position, [1, 0, 1])) < 0.1
     vehicle.land()
     assert vehicle.outcome.exit_code is ExitCode.OK
+
+
+def test_a_wish_of_another_type_is_refused_before_it_is_sent_and_its_text_is_accepted(flown):
+    vehicle, _ = flown
+    before = vehicle.request(Wish.SLOWER)
+    for wish in ("dance", None, 7, ["stop"]):
+        with pytest.raises(InputError, match="not a wish") as refused:
+            vehicle.ask(wish, [[1, 0, 1]])
+        assert "replace" in refused.value.hint
+    assert vehicle.request("replace", [[1, 0, 1]]) == before + 1
+    assert vehicle.ask("extend", [[0, 1, 1]]).verdict is PathVerdict.ACCEPTED
+    with pytest.raises(RequestRefusedError):
+        vehicle.ask("replace", [[0, 0, 9]])
+
+
+def test_a_number_that_no_request_has_gets_no_answer_and_the_record_stays_readable(connect):
+    with connect() as vehicle:
+        vehicle.take_off(0.8)
+        vehicle.fly([[1, 0, 1]])
+        begun = vehicle.time
+        for number in (77, "x", None, [1]):
+            with pytest.raises(InputError, match="no request"):
+                vehicle.answer_to(number)
+        assert vehicle.time == begun
+    assert read_record(vehicle.record).answers.verdict.tolist() == ["accepted"]
 
 
 def test_a_request_to_go_where_it_is_is_accepted(flown):
@@ -295,7 +321,7 @@ def test_landing_in_motion_stops_along_the_path(flown):
 
 
 def test_a_take_off_that_cannot_be_is_refused_and_nothing_is_armed(limits):
-    for height in (1.9, 0.0, np.nan, "high"):
+    for height in (1.9, 0.0, np.nan, "high", [0.8], [0.8, 0.8], 10**400):
         flight = SteppedSteering(limits)
         with SteeredVehicle(flight, limits, uri="sim://0") as vehicle, pytest.raises((InfeasibleError, InputError)):
             vehicle.take_off(height)
