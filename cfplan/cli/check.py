@@ -32,6 +32,8 @@ def check(path_or_plan: Path, safety_file: Path | None, as_json: bool, **plannin
     """
     steps = Steps(as_json=as_json)
     if path_or_plan.is_dir():
+        unused = "safety_file", *options.PLANNING
+        options.refuse(unused, "a record is certified again as it was flown, under its own limits", "leave it out")
         return _check_record(path_or_plan, steps)
     if fleet.is_fleet(path_or_plan):
         fleet.rehearse_and_print(path_or_plan, safety_file, planning, steps)

@@ -40,7 +40,9 @@ Examples:
 @click.option(
     "--pieces", type=click.IntRange(1, 255), help="Maximum number of pieces.  [default: 31, as a vehicle holds]"
 )
-@click.option("--rate", type=click.FloatRange(1, 1000), default=100.0, show_default=True, help="Rate of samples, Hz.")
+@click.option(
+    "--rate", type=options.FiniteRange(1, 1000), default=100.0, show_default=True, help="Rate of samples, Hz."
+)
 @click.option("--force", is_flag=True, help="Overwrite the output.")
 @options.as_json
 def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path, as_json: bool, **rest: Any) -> None:
@@ -53,7 +55,7 @@ def export(path_or_plan: Path, safety_file: Path | None, form: str, output: Path
     """
     plain, pieces, rate, force = (rest.pop(name) for name in ("plain", "pieces", "rate", "force"))
     steps = Steps(as_json=as_json)
-    _check_pieces(form, pieces)
+    _check_options(form, pieces)
     if fleet.is_fleet(path_or_plan):
         fleet.check_folder(output, force)
         settings = fleet.ExportSettings(form, output, leads=not plain, pieces=pieces, rate=rate)
@@ -88,7 +90,12 @@ def _print(document: dict[str, Any], certificate: "Certificate", *, as_json: boo
     print_json(document) if as_json else print_certificate(certificate)
 
 
-def _check_pieces(form: str, pieces: int | None) -> None:
+def _check_options(form: str, pieces: int | None) -> None:
+    """Raise InputError for options that the form does not have, or too many pieces."""
+    if form == "samples":
+        options.refuse(("plain", "pieces"), "samples are those of the plan, not of polynomials", "leave it out")
+    else:
+        options.refuse(("rate",), f"{form} has no samples", "leave it out, or choose --to samples")
     if pieces is not None and form != "crazyswarm" and pieces > 31:
         raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
 

@@ -181,7 +181,7 @@ def _source_of_waypoints(path_or_plan: Path | None, lines: str | None, on_board:
             hint="name a path file, or --example figure8, or give --waypoints -",
         )
     hint = "leave it out; to fly slower, lower `speed` of `plan` in safety.yaml"
-    options.refuse((*options.NEW_PLAN, "budget"), "waypoints received in flight are planned without this option", hint)
+    options.refuse(options.PLANNING, "waypoints received in flight are planned without this option", hint)
     return lines
 
 

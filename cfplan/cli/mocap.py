@@ -25,7 +25,9 @@ Examples:
   cfplan mocap qualisys://192.168.1.3         optitrack:// and vrpn:// likewise""",
 )
 @click.argument("uri")
-@click.option("--seconds", type=click.FloatRange(0.1, 86400), default=5.0, show_default=True, help="Time to look, s.")
+@click.option(
+    "--seconds", type=options.FiniteRange(0.1, 86400), default=5.0, show_default=True, help="Time to look, s."
+)
 @options.as_json
 def mocap(uri: str, seconds: float, as_json: bool) -> int:
     """Show the bodies that the motion capture system at URI sees, and how regularly its frames arrive."""

@@ -1,6 +1,7 @@
 """Arguments and options that several commands share."""
 
 import errno
+import math
 import os
 import tempfile
 from collections.abc import Callable, Collection
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
 SAFETY_FILE = "safety.yaml"
 NEW_PLAN = ("planner", "model", "nodes", "speed_factor")  # parameters of planning() that determine the plan
+PLANNING = (*NEW_PLAN, "budget")
 
 as_json = click.option("--json", "as_json", is_flag=True, help="Print one JSON document instead of text.")
 _EXAMPLE = f"{__name__}.example"
@@ -74,7 +76,18 @@ def _remember_verbose(context: click.Context, _: click.Parameter, verbose: bool)
     context.meta[VERBOSE] = verbose
 
 
-class _SpeedFactor(click.FloatRange):
+class FiniteRange(click.FloatRange):
+    """A range of numbers without NaN, which click's ranges let pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number; fail if it is not finite, or outside the range."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
+
+
+class _SpeedFactor(FiniteRange):
     """A factor on the allowed speed, whose error message also explains that it is not in m/s."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
@@ -107,7 +120,7 @@ _PLANNING = (
     click.option("--nodes", type=click.IntRange(4), help="Grid intervals.  [default: by the path's length]"),
     click.option(
         "--budget",
-        type=click.FloatRange(0, min_open=True),
+        type=FiniteRange(0, min_open=True),
         help="Longest planning time, s, without compiling.  [default: 5, plus 0.02 per metre]",
     ),
     click.option(
@@ -197,7 +210,7 @@ def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path
     from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions
 
     if path_file.suffix == PLAN_SUFFIX:
-        refuse((*NEW_PLAN, "budget"), "a plan file is flown as it was planned", "plan the path again with this option")
+        refuse(PLANNING, "a plan file is flown as it was planned", "plan the path again with this option")
     rest = {name: value for name, value in planning.items() if name != "model"}
     model: Path | None = planning["model"]
     if model is not None and not (model / "card.json").is_file():

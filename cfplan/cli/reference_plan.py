@@ -31,6 +31,7 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 
     file = source / PLAN_FILE if (source / PLAN_FILE).is_file() else source
     if file.suffix == PLAN_SUFFIX:  # as planned then, under the limits in the file
+        options.refuse(("safety_file",), "the plan of --plan is shown as it was planned", "leave it out")
         from cfplan.planning.plan_file import load_plan
 
         with steps.step("plan") as results:

@@ -26,6 +26,8 @@ Examples:
   cfplan replay vicon.csv --subject cf1 --plan records/20261122-094221-figure8
   cfplan replay vicon.csv --subject cf1 --plan flights/figure8.yaml"""
 
+_OF_A_VIEW = "plan_file", "safety_file", "names", "angles", "save", "png", "figure", "gif", "moment", "force"
+
 
 @click.command(short_help="Look at flights and logs in rerun.", epilog=EPILOG)
 @click.argument("flights", metavar="FLIGHT...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -86,18 +88,30 @@ def replay(
     one = len(flights) == 1 and plan_file is None
     one_fleet, one_record = one and is_fleet_record(flights[0]), one and is_record(flights[0])
     if not one_fleet and len(flights) == 1 and (records := flights_in(flights[0])):
+        options.refuse(_OF_A_VIEW, "a folder of records is only listed", "name one of its flights")
         return print_flights(records, as_json=as_json)
     steps, files = Steps(as_json=as_json), Files(save, png, figure, gif, moment, force)
     files.check(one_record=one_record)
+    _refuse_unused(flights, plan_file)
     if one_fleet:
         document = _replay_fleet(flights[0], files, steps)
     elif one_record:
         document = _replay_record(flights[0], files, steps)
     else:
-        reference = _reference(plan_file, safety_file, steps)
-        document = _replay_trials(flights, reference, names, angles, files, steps)
+        document = _replay_trials(flights, _reference(plan_file, safety_file, steps), names, angles, files, steps)
     if as_json:
         print_json(document | files.to_json())
+
+
+def _refuse_unused(flights: tuple[Path, ...], plan_file: Path | None) -> None:
+    """Raise InputError for limits without a path to plan, or for options of logs with records alone."""
+    from cfplan.recording.fleet_record import is_fleet_record
+    from cfplan.recording.reader import is_record
+
+    if plan_file is None:
+        options.refuse(("safety_file",), "limits are needed only for the path of --plan", "leave it out")
+    if all(is_record(each) or is_fleet_record(each) for each in flights):
+        options.refuse(("names", "angles"), "this is for logs of motion capture, not for records", "leave it out")
 
 
 @dataclass(frozen=True, slots=True)

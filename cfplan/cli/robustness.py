@@ -28,7 +28,7 @@ COLUMNS = [
 )
 @click.option("--planner", default="auto", show_default=True, help="auto, learned, expert, convex or minsnap.")
 @click.option(
-    "--epsilon", "scales", type=click.FloatRange(0, min_open=True), multiple=True,
+    "--epsilon", "scales", type=options.FiniteRange(0, min_open=True), multiple=True,
     help="Largest displacement of the path, m; repeatable.  [default: 0.001, 0.01, 0.1]",
 )  # fmt: skip
 @click.option("--draws", type=click.IntRange(1), default=10, show_default=True, help="Perturbed paths per --epsilon.")

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 AIRFRAME_FILE = Path("airframe.yaml")
 _DEFAULT_VEHICLE = "crazyflie-2.1+"
+_OF_LOGS = "gains", "polynomials", "time_scale", "plan", "offset"  # parameters that records do not need
 
 
 @click.command(
@@ -30,10 +31,20 @@ Examples:
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
 @click.option("--gains", type=click.Path(path_type=Path), help="YAML file of the controller's gains; for microSD logs.")
 @click.option("--polynomials", type=click.Path(path_type=Path), help="Trajectory flown from the vehicle's memory, CSV.")
-@click.option("--time-scale", type=float, default=1.0, show_default=True, help="Time scale of the polynomials.")
+@click.option(
+    "--time-scale",
+    type=options.FiniteRange(0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help="Time scale of the polynomials.",
+)
 @click.option("--plan", type=click.Path(path_type=Path), help="Plan flown from the vehicle's memory, Parquet.")
 @click.option("--offset", type=float, nargs=3, help="Place of the trajectory's origin, m, if setpoints are not logged.")
-@click.option("--mass", type=float, help="Mass with battery, kg.  [default: that of --vehicle, else the controller's]")
+@click.option(
+    "--mass",
+    type=options.FiniteRange(0, min_open=True),
+    help="Mass with battery, kg.  [default: that of --vehicle, else the controller's]",
+)
 @click.option("--vehicle", help="Airframe, by name or file.  [default: the record's, or crazyflie-2.1+]")
 @click.option("--from", "begin", type=float, default=0.0, show_default=True, help="Start of the part to validate, s.")
 @click.option("--to", "end", type=float, default=float("inf"), help="End of the part to validate, s.  [default: all]")
@@ -55,13 +66,13 @@ def validate(
 
     The prediction holds if rms and largest deviation agree within 20 % and correlate by 0.95; else the exit code is 4.
     """
-    from cfplan.identification.airframe_yaml import check_target, write_airframe
+    from cfplan.identification.airframe_yaml import write_airframe
     from cfplan.identification.measured import pooled
     from cfplan.identification.validate import validate as fly_again
     from cfplan.identification.validation_page import verdict, write_validation_page
 
     steps = Steps(as_json=as_json)
-    check_target(output, overwrite=force)
+    _check_options(logs, output, report, force)
     found: list[Validation] = []
     for place in logs:
         with steps.step("read") as results:
@@ -88,6 +99,22 @@ def validate(
         raise SystemExit(int(ExitCode.NOT_CERTIFIED))
 
 
+def _check_options(logs: tuple[Path, ...], output: Path, report: Path | None, force: bool) -> None:
+    """Raise InputError, before anything is computed, for options that are not used, or files that exist."""
+    from cfplan.files.atomic import check_new_file
+    from cfplan.identification.airframe_yaml import check_target
+
+    if all(map(_is_record, logs)):
+        options.refuse(_OF_LOGS, "this is for microSD logs: a record holds its controller and its plan", "leave it out")
+    check_target(output, overwrite=force)
+    if report is not None:
+        check_new_file(report, overwrite=force)
+
+
+def _is_record(place: Path) -> bool:
+    return place.is_dir() or place.suffix == ".mcap"
+
+
 def _read(
     place: Path, *, gains: Path | None, polynomials: Path | None, time_scale: float, plan: Path | None,
     offset: tuple[float, float, float] | None, mass: float | None, vehicle: str | None, begin: float, end: float,
@@ -100,7 +127,7 @@ def _read(
     from cfplan.vehicle.airframes import load_airframe
 
     airframe = load_airframe(vehicle) if vehicle else None
-    if place.is_dir() or place.suffix == ".mcap":
+    if _is_record(place):
         flight = flight_of_record(read_record(place), begin, end)
         known = airframe or flight.airframe
         return replace(flight, airframe=replace(known, mass=mass or known.mass))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from cfplan.cli.options import SAFETY_FILE
+from cfplan.cli.options import SAFETY_FILE, FiniteRange
 from cfplan.cli.output import Steps
 from cfplan.errors import InputError, LinkError
 from cfplan.files.nearest import nearest
@@ -64,7 +64,7 @@ Examples:
     "--flow-deck", is_flag=True,
     help="Report a flow deck, for scripts that require one; poses on board do not change.",
 )  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0.1), help="Time to serve, s.  [default: until Ctrl-C]")
+@click.option("--seconds", type=FiniteRange(0.1), help="Time to serve, s.  [default: until Ctrl-C]")
 @click.option("--live", is_flag=True, help="Show the first vehicle in rerun.")
 @click.option(
     "--safety", "safety_file", type=click.Path(path_type=Path),
