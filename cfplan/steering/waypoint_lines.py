@@ -12,6 +12,7 @@ take effect as soon as they are read, before all waiting lines.
 import contextlib
 import os
 import queue
+import select
 import socket
 import stat
 import sys
@@ -37,6 +38,7 @@ MAX_BATCH = 20  # waiting waypoints that are planned as one request
 MAX_WAITING = 10_000  # lines; more are refused
 MAX_LINE_BYTES = 10_000  # bytes of a line
 _PATIENCE = 0.1  # s
+_ANSWERS_TIMEOUT = 180.0  # s after a client's last line, which may wait for the take-off
 _OWNER_ONLY = 0o177  # umask: only the owner may connect
 _HINT = "write x y z in metres, as 1.0 0.0 1.2; or replace, stop, slower, faster, land, cut"
 _PLACE_HINT = "write - for standard input, or unix:PATH for a socket, as unix:waypoints.sock"
@@ -192,7 +194,7 @@ class QueuedLines:
     def __init__(self) -> None:
         self._queue: queue.Queue[TextLine | None] = queue.Queue(MAX_WAITING)
         self._orders: deque[Order] = deque()
-        self._number = 0
+        self.taken = 0  # lines so far; each is answered once
         self.ending = False
 
     def next(self, patience: float) -> TextLine | None:
@@ -214,8 +216,8 @@ class QueuedLines:
         text = content.decode("utf-8", "replace")
         if not text.strip() or text.lstrip().startswith("#"):
             return
-        self._number += 1
-        line = TextLine(self._number, text, reply)
+        self.taken += 1
+        line = TextLine(self.taken, text, reply)
         if (order := order_of(text)) is not None:
             self._orders.append(order)
             self.ending = True
@@ -348,19 +350,29 @@ def _serve(server: socket.socket, lines: QueuedLines) -> None:
 
 
 def _attend(client: socket.socket, lines: QueuedLines, busy: threading.Lock) -> None:
-    hears = True
+    """Take a client's lines, then wait until all are answered, unless the client is gone or does not read."""
+    hears, answered, before = True, 0, lines.taken
+    one_answer = threading.Lock()
 
     def reply(text: str) -> None:
         """Answer unless the client is gone or does not read its answers; never wait for it."""
-        nonlocal hears
+        nonlocal hears, answered
         answer = f"{text}\n".encode()
-        try:
-            hears = hears and client.send(answer, socket.MSG_DONTWAIT) == len(answer)
-        except OSError:
-            hears = False
+        with one_answer:
+            try:
+                hears = hears and client.send(answer, socket.MSG_DONTWAIT) == len(answer)
+            except OSError:
+                hears = False
+            answered += 1
 
     try:
         with client, client.makefile("rb") as stream:
             lines.read(stream, reply, fragments=False)
+            gone = select.poll()
+            gone.register(client, 0)  # reports a client that has closed its socket, not one that only ended its lines
+            until = REAL_CLOCK.now() + _ANSWERS_TIMEOUT
+            while hears and answered < lines.taken - before and REAL_CLOCK.now() < until:
+                if gone.poll(1000.0 * _PATIENCE):
+                    break
     finally:
         busy.release()

@@ -262,6 +262,18 @@ def test_an_order_needs_no_newline(place):
         assert until(lambda: lines.ending)
 
 
+def test_a_client_that_ends_its_lines_stays_until_they_are_answered(place):
+    with opened_lines(place, print) as lines, connected() as client:
+        client.sendall(b"1 0 1\n0 1 1\n")
+        client.shutdown(socket.SHUT_WR)
+        first, second = lines.next(60.0), lines.next(60.0)
+        first.answer("accepted")
+        with connected() as another:
+            assert b"another client" in another.recv(100)
+        second.answer("refused")
+        assert client.makefile("rb").read() == b"1 accepted\n2 refused\n"
+
+
 def test_nobody_else_may_connect_and_no_port_is_open(place):
     before = os.umask(0)
     try:
