@@ -132,13 +132,17 @@ speed: 0.5            # factor on the speed that safety.yaml allows
 
 
 def _write(folder: Path, texts: dict[str, str]) -> None:
-    """Write the files without ever overwriting one, not even one created meanwhile. Raises InputError."""
+    """Write all files or none, without ever overwriting one, not even one created meanwhile. Raises InputError."""
+    written: list[Path] = []
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             with (folder / name).open("x", encoding="utf-8") as stream:
+                written.append(folder / name)
                 stream.write(text)
     except OSError as error:
+        for file in written:
+            file.unlink()
         raise InputError(
             f"cannot be written ({error.strerror or error})", where=str(folder), hint="name another folder"
         ) from error

@@ -204,6 +204,13 @@ def test_what_the_system_refuses_is_one_line(folder, line, json):
     assert ended.returncode == 2
 
 
+def test_a_full_disk_leaves_nothing_that_keeps_init_from_a_second_try(folder):
+    ended = run_in_shell("ulimit -f 2; cfplan init lab --room 4x6x2.5")  # 2 blocks a file, less than safety.yaml
+    assert ended.returncode == 2
+    assert "lab: cannot be written" in ended.stderr
+    assert list((folder / "lab").iterdir()) == []
+
+
 def test_a_terminal_of_few_characters_is_no_error(folder):
     ended = run_in_shell("PYTHONIOENCODING=latin-1 cfplan init lab")
     assert (ended.returncode, ended.stderr) == (0, "")
