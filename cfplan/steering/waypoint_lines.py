@@ -10,6 +10,7 @@ take effect as soon as they are read, before all waiting lines.
 """
 
 import contextlib
+import io
 import os
 import queue
 import select
@@ -263,7 +264,7 @@ def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLin
 
         def read() -> None:
             try:
-                lines.read(sys.stdin.buffer, reply, fragments=True)
+                lines.read(_standard_input(), reply, fragments=True)
             finally:
                 lines.end()
 
@@ -276,6 +277,14 @@ def opened_lines(place: str, reply: Callable[[str], None]) -> Iterator[QueuedLin
     with _listening(Path(path)) as server:
         threading.Thread(target=_serve, args=(server, lines), name="waypoint socket", daemon=True).start()
         yield lines
+
+
+def _standard_input() -> IO[bytes]:
+    """Open standard input again: the interpreter aborts if a thread still reads from `sys.stdin` when it exits."""
+    try:
+        return open(sys.stdin.fileno(), "rb", closefd=False)
+    except io.UnsupportedOperation:  # a program replaced it by a stream without a file
+        return sys.stdin.buffer
 
 
 @contextlib.contextmanager

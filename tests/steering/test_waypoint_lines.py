@@ -4,9 +4,12 @@ import math
 import os
 import socket
 import stat
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from subprocess import PIPE
 
 import numpy as np
 import pytest
@@ -190,6 +193,22 @@ def test_any_line_is_a_wish_or_an_error_of_one_line(text):
     else:
         assert wish in Wish
         assert np.isfinite(np.array(waypoints)).all()
+
+
+LANDS = """
+from cfplan.steering.waypoint_lines import opened_lines
+with opened_lines("-", print) as lines:
+    while not lines.ending:
+        lines.next(0.1)
+"""
+
+
+def test_a_program_ends_in_order_though_its_standard_input_is_still_open():
+    with subprocess.Popen([sys.executable, "-c", LANDS], stdin=PIPE, stdout=PIPE, stderr=PIPE) as program:
+        program.stdin.write(b"land\n")
+        program.stdin.flush()
+        assert program.wait(120.0) == 0, program.stderr.read()
+        assert program.stdout.read() == b"1 accepted: land\n"
 
 
 @pytest.fixture
