@@ -5,13 +5,16 @@ from pathlib import Path
 
 import pytest
 from slow_cases import slow_unless
+from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.telemetry import Phase
 from cfplan.preparation.prepare_flight import prepare_mission
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
+from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
+from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
 from cfplan.simulation.virtual_vicon.faults import FaultKind, ViconFault
 from studies.stepped_flight import FOR_GOOD, Scenario, fly_scenario
 
@@ -79,7 +82,32 @@ def test_an_uplink_and_poses_that_are_both_gone_end_by_link_loss_inside(line, ph
 def test_logs_that_the_vehicle_deleted_while_its_radio_was_dead_are_created_anew(line, kind, back_after):
     flown = fly_silenced(line, Phase.STREAM, RadioFault(kind, 0.0, back_after))
     assert_down(flown)
-    if back_after > 1.0:  # only the log shows that its watchdog has stopped the motors
-        assert "the vehicle locked" in flown.reason
+    if back_after > 1.0:  # its watchdog has stopped the motors
+        assert flown.rung == "cut"
+        assert "nothing was acknowledged for 1." in flown.reason
     else:
         assert flown.rung == "land"
+
+
+@pytest.mark.parametrize("setpoint", [60, 150])
+def test_a_vehicle_that_restarts_in_the_air_is_not_flown_from_where_it_fell(line, setpoint):
+    x, y, _ = line.start[0]
+    lab = SteppedLab(line.limits.airframe, vehicle=VehicleSettings(position=(x, y, 0.0)))
+    restarted = []
+
+    def restart():
+        restarted.append(lab.now)
+        lab.clock.at(lab.now, lab.vehicle.firmware.restart)
+
+    flown = fly_stepped(line, at_setpoint(setpoint, restart), lab=lab)
+    assert flown.outcome.rung is Rung.CUT
+    truth = flown.truth
+    assert not truth.motor[truth.time > restarted[0] + 0.1].any()
+    assert truth.position[-1, 2] < 0.05
+
+
+def test_an_armed_vehicle_that_is_left_alone_on_the_floor_locks(line):
+    """Here one that arms only on request, so that nothing but its watchdog would disarm it for half a minute."""
+    dead = RadioFault(RadioFaultKind.DEAD, 0.0, FOR_GOOD)
+    flown = fly_scenario(Scenario("armed", Rung.NONE, (dead,), Phase.ARM, 0.25, grounded=True), line)
+    assert (flown.landed, flown.disarmed, flown.locked) == (True, True, True)

@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from cfplan.errors import ExitCode
+from cfplan.flight.firmware import Timeouts
 from cfplan.flight.mocap.poses import Pose
 from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.health import FRESH, GONE, LOG_GONE, UPLINK_GONE, Health
@@ -21,6 +22,7 @@ from cfplan.safety.space import inside
 
 LATEST_SETPOINT = 0.25  # s, latest setpoint; the vehicle stops following after 0.5 s
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit on the distance between estimate and pose, in the air
+_HEARD_SINCE = 0.1  # s; packets may have arrived this much later than the last ping that was answered
 FALLEN = 0.15  # m; a vehicle on the floor that is farther below its setpoint has fallen
 
 
@@ -39,6 +41,7 @@ class Observation:
     """m, setpoint at the time of the estimate; None if there was none."""
     status: VehicleStatus | None = None  # None while its log is gone
     late: float = 0.0  # s, lateness of the last setpoint
+    uplink_silent: float = 0.0  # s, for which nothing has been acknowledged
 
 
 # When each quantity that has a ladder was measured, s, and its value; None while the log that reports it is gone.
@@ -59,6 +62,7 @@ class AbortMonitor:
 
     def __init__(self, limits: Limits):
         self._limits = limits
+        self._alone_after = Timeouts().motors_off_at_latest(limits.firmware.watchdog) + _HEARD_SINCE
         self._voltage: float | None = None
         self._voltage_time = 0.0
         self._since: dict[tuple[str, Rung], float] = {}
@@ -81,6 +85,10 @@ class AbortMonitor:
         """Return the abort that the present health calls for; its text names the most important silent source."""
         health, pose = observation.health, observation.pose
         rung, age_brake = health.reaction.rung, self._limits.pose.age_brake
+        if observation.uplink_silent > self._alone_after:
+            # It has stopped its motors, and may have restarted since: it must not be flown from where it lies.
+            reason = f"nothing was acknowledged for {observation.uplink_silent:.1f} s"
+            return AbortReason.LINK_LOST.abort(Rung.CUT, reason=reason)
         if health.uplink is GONE:
             return AbortReason.UPLINK_GONE.abort(rung, seconds=UPLINK_GONE)
         if health.poses is not FRESH and pose is None:

@@ -107,6 +107,7 @@ class FlightLoop:
         self._begun: deque[Stream] = deque(maxlen=_MAX_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why there is no good pose
         self._forwarded = math.inf  # s, time of the last forwarded pose
+        self._watching = False  # the vehicle's watchdog is fed
         self._kept_alive = -math.inf  # s, time of the last keep-alive packet
         self._motor_test_polled = math.inf  # s, time of the last query for a motor test
         self.waking: deque[float] = deque(maxlen=200)  # s, lateness of the last ticks
@@ -141,6 +142,10 @@ class FlightLoop:
     def watch_motor_test(self) -> None:
         """From now on, end a motor test that another client starts, and the flight with it."""
         self._motor_test_polled = -math.inf
+
+    def watch(self) -> None:
+        """From now on feed the vehicle's watchdog, which locks a vehicle that is left alone, on the floor too."""
+        self._watching = True
 
     def lift_off(self) -> None:
         """From now on every trigger of the abort ladder counts, not only orders."""
@@ -309,8 +314,7 @@ class FlightLoop:
             self.history.late.append(now - due)
 
     def _keep_alive(self, now: float) -> None:
-        watched = self.airborne or self.watched  # until the link closes; the vehicle locks 1 s later
-        if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
+        if self._watching and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
 
@@ -400,14 +404,15 @@ class FlightLoop:
 
     def _monitor_flight(self, now: float, late: float) -> None:
         """Raise LinkLost if the link is lost, and in the air AbortRaised if there is a reason to abort."""
-        link, estimate = self.link, self.estimate
-        if link.lost or (self.airborne and self._health_monitor.uplink_silent > LINK_LOST_AFTER):
+        silent = self._health_monitor.uplink_silent
+        if self.link.lost or (self.airborne and silent > LINK_LOST_AFTER):
             raise LinkLost
         if not self.airborne or self._stopped():
             return
-        pose = self.tracker.last
+        pose, estimate = self.tracker.last, self.estimate
         observation = Observation(
             now=now,
+            uplink_silent=silent,
             pose=pose,
             pose_fault=self.pose_fault,
             health=self.health,

@@ -251,11 +251,13 @@ def stop_until_confirmed(loop: FlightLoop, send: Callable[[], object]) -> bool:
     """
 
     def stopped() -> bool:
-        return loop.health.status is FRESH and not loop.bits(FLYING)
+        status = loop.status
+        return status is not None and status.time > asked and not loop.bits(FLYING)
 
     loop.end_stream()
     loop.expect_stop()
     for _ in range(ATTEMPTS):
+        asked = loop.now()
         send()
         loop.until(lambda: stopped() or loop.health.status_unknown, MOTORS_STOP_TIMEOUT)
         if stopped():

@@ -4,6 +4,7 @@ Each rung of the abort ladder can only be left for a graver one. The manoeuvres 
 setpoints, or by its on-board commander.
 """
 
+import math
 from collections.abc import Callable
 
 from cfplan.errors import CfplanError, ExitCode, LinkError
@@ -14,7 +15,7 @@ from cfplan.flight.pilot.abort_reasons import Abort, AbortReason
 from cfplan.flight.pilot.conducted import NO_CONDUCTOR, ConductorSource
 from cfplan.flight.pilot.flight_history import FlightHistory
 from cfplan.flight.pilot.flight_loop import ATTEMPTS, LINK_LOST_AFTER, AbortRaised, FlightLoop, LinkLost, OrderSource
-from cfplan.flight.pilot.health import FRESH
+from cfplan.flight.pilot.health import FRESH, GONE
 from cfplan.flight.pilot.manoeuvres import Manoeuvres
 from cfplan.flight.pilot.mission import Mission
 from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
@@ -140,6 +141,8 @@ class Pilot:
             status = loop.link.status
             return status is not None and bool(status.supervisor & LOCKED) and not any(status.motor)
 
+        if not locked():  # while the radio is dead, wait: it may come back, and the vehicle may have restarted
+            loop.until(lambda: locked() or loop.health.uplink is not GONE, math.inf)
         if not locked() and not loop.until(locked, CUT_TIMEOUT):
             self._history.add_event(Level.ERROR, "the vehicle does not confirm that its motors were cut")
         loop.touch_down()
@@ -177,7 +180,7 @@ class Pilot:
         while heard < ATTEMPTS and loop.now() < give_up:
             asked = loop.now()
             loop.link.arm(False)
-            if loop.until(lambda: loop.health.status is FRESH and shown(), _DISARM_TIMEOUT):
+            if loop.until(shown, _DISARM_TIMEOUT):
                 return True
             heard += loop.health.uplink is FRESH
         return False

@@ -23,6 +23,7 @@ _CLOSE_TIMEOUT = 2.0  # s for closing
 _MILLI = 1e-3
 _CLOCK_DRIFT = 5e-4  # relative difference of the vehicle's clock
 _STAMPS_WRAP = (1 << 24) * _MILLI  # s
+_WRAP_TOLERANCE = 60.0  # s
 _ESTIMATE = [f"stateEstimateZ.{name}" for name in ("x", "y", "z", "vx", "vy", "vz", "ax", "ay", "az")]
 ESTIMATE_LOG = ([(name, "int16_t") for name in _ESTIMATE] + [("stateEstimateZ.quat", "uint32_t")], 10)
 STATUS_LOG = (
@@ -214,8 +215,8 @@ class Link:
         """Return when, s, the vehicle wrote a message; after a pause of the radio, old ones arrive."""
         now = self._clock.now()
         zero = now - stamp_ms * _MILLI
-        if abs(zero - self._log_zero) > _STAMPS_WRAP / 2:  # the first message, or the 24 bits wrapped
-            self._log_zero = zero
+        if math.isinf(self._log_zero) or abs(zero - self._log_zero - _STAMPS_WRAP) < _WRAP_TOLERANCE:
+            self._log_zero = zero  # the first message, or the 24 bits wrapped; after a restart all messages seem old
         self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self._log_heard), zero)
         self._log_heard = now
         return self._log_zero + stamp_ms * _MILLI

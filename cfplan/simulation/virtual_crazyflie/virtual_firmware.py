@@ -39,7 +39,7 @@ from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import yaw_of
 
 COMMANDER_PERIOD = 10  # ticks of 1 ms between runs of planner and log blocks
-_BOOT = 500  # ms from a restart until it answers
+_BOOT = 2000  # ms from a restart until it answers
 _CONNECTION_LASTS = round(1000 * Timeouts().connection)  # ms
 
 _SETPOINT_CHANNEL, _META_CHANNEL = 0, 1

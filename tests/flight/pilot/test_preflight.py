@@ -140,7 +140,7 @@ def test_a_vehicle_that_does_not_tell_its_firmware_is_refused(ground):
     assert failures(replace(ground, firmware="")) == ["firmware", "supervisor's time-outs"]
 
 
-@pytest.mark.parametrize("firmware", ["2026.08.1", "2026.09", "2031.11"])
+@pytest.mark.parametrize("firmware", ["2026.08.1", "2026.08 +37", "2026.08-312", "2026.09", "2031.11"])
 def test_a_firmware_newer_than_those_known_is_refused_unless_the_limits_name_it(ground, mission, firmware):
     newer = replace(ground, firmware=firmware)
     (refused,) = (check for check in run_checks(newer) if not check.passed)
