@@ -45,7 +45,7 @@ ROW_SIZE = 24
 class Truth:
     """The true motion: for tests and reports, never for a pilot. One row every 10 ms."""
 
-    time: NDArray  # (N,) s on the clock of time.monotonic()
+    time: NDArray  # (N,) s on the flight's clock
     position: NDArray  # (N, 3) m
     velocity: NDArray  # (N, 3) m/s
     quaternion: NDArray  # (N, 4) body→world x y z w
