@@ -133,7 +133,8 @@ def version_of(text: str) -> tuple[int, ...]:
     if not found:
         return ()
     release = tuple(int(part) for part in found[1].split("."))
-    return (*release, *(0,) * (3 - len(release)), int(found[2])) if found[2] else release
+    commits = int(found[2] or 0)
+    return (*release, *(0,) * (3 - len(release)), commits) if commits else release
 
 
 def version_text(version: tuple[int, ...]) -> str:

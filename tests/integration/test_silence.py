@@ -104,10 +104,3 @@ def test_a_vehicle_that_restarts_in_the_air_is_not_flown_from_where_it_fell(line
     truth = flown.truth
     assert not truth.motor[truth.time > restarted[0] + 0.1].any()
     assert truth.position[-1, 2] < 0.05
-
-
-def test_an_armed_vehicle_that_is_left_alone_on_the_floor_locks(line):
-    """Here one that arms only on request, so that nothing but its watchdog would disarm it for half a minute."""
-    dead = RadioFault(RadioFaultKind.DEAD, 0.0, FOR_GOOD)
-    flown = fly_scenario(Scenario("armed", Rung.NONE, (dead,), Phase.ARM, 0.25, grounded=True), line)
-    assert (flown.landed, flown.disarmed, flown.locked) == (True, True, True)

@@ -107,7 +107,6 @@ class FlightLoop:
         self._begun: deque[Stream] = deque(maxlen=_MAX_STREAMS)  # the last streams, each with its start
         self.pose_fault = ""  # why there is no good pose
         self._forwarded = math.inf  # s, time of the last forwarded pose
-        self._watching = False  # the vehicle's watchdog is fed
         self._kept_alive = -math.inf  # s, time of the last keep-alive packet
         self._motor_test_polled = math.inf  # s, time of the last query for a motor test
         self.waking: deque[float] = deque(maxlen=200)  # s, lateness of the last ticks
@@ -142,10 +141,6 @@ class FlightLoop:
     def watch_motor_test(self) -> None:
         """From now on, end a motor test that another client starts, and the flight with it."""
         self._motor_test_polled = -math.inf
-
-    def watch(self) -> None:
-        """From now on feed the vehicle's watchdog, which locks a vehicle that is left alone, on the floor too."""
-        self._watching = True
 
     def lift_off(self) -> None:
         """From now on every trigger of the abort ladder counts, not only orders."""
@@ -314,7 +309,8 @@ class FlightLoop:
             self.history.late.append(now - due)
 
     def _keep_alive(self, now: float) -> None:
-        if self._watching and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
+        watched = self.airborne or self.watched  # until the link closes; the vehicle locks 1 s later
+        if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
             self._kept_alive = now
             self.link.keep_alive()
 

@@ -56,7 +56,6 @@ def prepare(
     loop.history.enter(Phase.ARM)
     loop.restart_deadlines()
     floor = loop.pose().position[2]
-    loop.watch()
     for _ in range(ATTEMPTS):  # a busy radio may drop one
         loop.link.arm(True)
         if loop.until(lambda: loop.bits(ARMED | CAN_FLY) == ARMED | CAN_FLY, 1.0):

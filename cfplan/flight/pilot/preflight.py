@@ -80,10 +80,11 @@ def firmware_check(firmware: str, limits: Limits) -> Check:
     """Compare the version with the oldest and the newest that may fly; how a newer one behaves is unknown."""
     oldest, newest, found = limits.firmware.oldest, limits.firmware.newest, version_of(firmware)
     if found > newest:
+        named = found if len(found) < 4 else (*found[:2], found[2] + 1)  # safety.yaml names releases
         return Check(
             "firmware", firmware, "≤ " + version_text(newest), False,
             "time-outs and controller were read from older firmware: fly with that; or compare them, and write "
-            f'newest: "{version_text(found)}" under firmware: in safety.yaml',
+            f'newest: "{version_text(named)}" under firmware: in safety.yaml',
         )  # fmt: skip
     value, hint, deviation = firmware or "unknown", "update the vehicle's firmware", earlier_deviation(found)
     if deviation:
