@@ -9,7 +9,7 @@ from slow_cases import slow_unless
 from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, InfeasibleError, InputError, PreflightError
-from cfplan.flight.on_board.commands import LAND
+from cfplan.flight.on_board.commands import GO_TO, LAND
 from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, read_compressed, read_raw
 from cfplan.flight.pilot.keys import HeldOrders, Order
@@ -24,6 +24,7 @@ from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
 from cfplan.simulation.virtual_crazyflie.faults import VehicleFault, VehicleFaultKind
 from cfplan.simulation.virtual_crazyflie.settings import VehicleSettings
+from cfplan.vehicle.rotations import matrices_of
 from studies.faults import SCENARIOS
 from studies.stepped_flight import FOR_GOOD, Scenario, fly_scenario
 
@@ -190,18 +191,41 @@ def test_the_operator_ends_it_by_a_stop_of_a_second(line):
     assert begun - flight.outcome.first_setpoint - row / line.mission.rate == pytest.approx(1.0, abs=0.15)
 
 
-def test_where_its_commander_refuses_to_land_setpoints_land_it(line):
+@pytest.mark.parametrize(("dead", "order"), [(0.4, Order.LAND), (0.85, None)])
+def test_it_stops_from_where_it_is_once_its_radio_returns(line, dead, order):
     lab, orders = SteppedLab(LIMITS.airframe), HeldOrders()
-    receive = lab.vehicle.firmware.planner.receive
+    row = int(2.0 * line.mission.rate)  # at full speed
+
+    def strike():
+        lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, dead))
+        orders.worst = order
+
+    flight = fly_stepped(line.mission, at_setpoint(row, strike), orders=orders, lab=lab)
+    assert flight.outcome.rung is Rung.LAND
+    assert flight.truth.off_in_air[-1] == 0
+    in_air = flight.truth.position[:, 2] > 0.3
+    tilt = np.degrees(np.arccos(matrices_of(flight.truth.quaternion[in_air])[:, 2, 2]))
+    assert tilt.max() < np.degrees(LIMITS.flight.stop_tilt)
+
+
+@pytest.mark.parametrize("command", [LAND, GO_TO])
+def test_where_its_commander_refuses_to_stop_or_to_land_setpoints_take_over(line, command):
+    lab, orders = SteppedLab(LIMITS.airframe), HeldOrders()
+    receive, row = lab.vehicle.firmware.planner.receive, len(line.mission.payloads) // 3
+    refusing = False
 
     def refuse(payload, *rest, **more):
-        if payload[0] == LAND:
-            return bytes((LAND, 0, 0, 8))  # ENOEXEC
+        if refusing and payload[0] == command:
+            return bytes((command, 0, 0, 8))  # ENOEXEC
         return receive(payload, *rest, **more)
 
+    def order():
+        nonlocal refusing
+        refusing = True
+        orders.give(Order.LAND)
+
     lab.vehicle.firmware.planner.receive = refuse
-    row = len(line.mission.payloads) // 3
-    flight = fly_stepped(line.mission, at_setpoint(row, lambda: orders.give(Order.LAND)), orders=orders, lab=lab)
+    flight = fly_stepped(line.mission, at_setpoint(row, order), orders=orders, lab=lab)
     assert (flight.outcome.exit_code, flight.outcome.rung) == (ExitCode.ENDED_BY_OPERATOR, Rung.LAND)
     assert flight.truth.off_in_air[-1] == 0
     assert flight.truth.position[-1, 2] == 0.0

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfplan.errors import PreflightError
 from cfplan.flight.on_board import commands
@@ -17,13 +18,14 @@ from cfplan.flight.on_board.go_to import STOP_DURATION, go_to_states, motion_of,
 from cfplan.flight.on_board.program import OnBoardProgram
 from cfplan.flight.pilot.abort_reasons import AbortReason
 from cfplan.flight.pilot.flight_loop import ATTEMPTS, AbortRaised, FlightLoop
-from cfplan.flight.pilot.health import GONE
+from cfplan.flight.pilot.health import FRESH, GONE
 from cfplan.flight.pilot.landing import Landing, stands_by_poses, stop_until_confirmed
 from cfplan.flight.pilot.manoeuvres import begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import go_to_time
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.pilot.streamed_manoeuvres import BRAKE_HOLD
+from cfplan.flight.radio.perishable import MAX_AGE
 from cfplan.flight.radio.supervisor_bits import TRAJECTORY_FINISHED
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, decode
@@ -97,7 +99,7 @@ class OnBoardManoeuvres:
     def __init__(self, loop: FlightLoop, floor: float, program: OnBoardProgram):
         self._loop, self._floor, self._program = loop, floor, program  # m, height of the tracked body before take-off
         self._mission, self._limits, self._history = loop.mission, loop.limits, loop.history
-        self._stopping = False  # a stop was commanded
+        self._stops = list[tuple[float, NDArray]]()  # commanded: s, when sent; (M, 29) uint8, the stop as setpoints
         self._landing = False  # the last descent has begun
 
     def take_off(self) -> None:
@@ -200,19 +202,41 @@ class OnBoardManoeuvres:
         loop, left = self._loop, self._loop.stream
         if left is None or self._landing:
             return
-        if not self._stopping and left.stop_from is not None:
-            self._stopping = True
-            rows = left.stop_from(left.index(loop.now()))
-            last = decode(rows[-1:].reshape(-1, PAYLOAD_SIZE))
-            (x, y, z), yaw = last.position[0].tolist(), float(yaw_of(tuple(last.quaternion[0].tolist())))
-            stop = Stream(rows, self._mission.rate, on_board=True)
-            if left is loop.plan:
-                self._history.stopped_at = loop.now()
-            answer = _ask(loop, commands.go_to(x, y, z, yaw, STOP_DURATION), lambda: loop.begin(stop))
-            if answer != commands.DONE:
-                self._history.add_event(Level.WARNING, f"the vehicle does not stop: {_answer_text(answer)}")
+        if left.stop_from is not None:
+            self._command_stop(left, left.stop_from)
         end = loop.stream.end if loop.stream is not None else 0.0
         loop.until(lambda: loop.now() > end, math.inf)
+
+    def _command_stop(self, left: Stream, stop_from: Callable[[int], NDArray]) -> None:
+        """Command a stop from the present setpoint of `left` until the vehicle answers; setpoints stop it otherwise.
+
+        Until it answers, it flies on along `left`, as does the reference. A stop is commanded only while the vehicle is
+        heard, and again only once it has answered a later ping instead: then the command before has perished.
+        """
+        loop, replies, rate = self._loop, self._loop.link.replies, self._mission.rate
+        while not self._stops or commands.GO_TO not in replies:
+            if left is loop.plan and loop.now() > left.end:  # it lands by itself
+                return
+            sent = self._stops[-1][0] if self._stops else -math.inf
+            if loop.health.uplink is FRESH and loop.link.acknowledged > sent + MAX_AGE:
+                if len(self._stops) == ATTEMPTS:
+                    break
+                replies.pop(commands.GO_TO, None)  # of the way to the start
+                self._stops.append((loop.now(), stop_from(left.index(loop.now()))))
+                loop.link.command(_go_to_end_of(self._stops[-1][1]))
+            loop.tick()
+        sent, rows = self._stops[-1]
+        if left is loop.plan:
+            self._history.stopped_at = sent
+        answer = replies.get(commands.GO_TO)
+        if answer == commands.DONE:
+            flown = min(round((loop.now() - sent) * rate), len(rows) - 1)
+            loop.begin(Stream(rows[flown:], rate, on_board=True))
+        else:
+            self._history.add_event(
+                Level.WARNING, f"the vehicle does not stop: {_answer_text(answer)}; setpoints stop it"
+            )
+            loop.begin(Stream(stop_from(left.index(loop.now())), rate))
 
     def _begin_landing(self) -> None:
         if not self._landing:
@@ -255,3 +279,10 @@ class OnBoardManoeuvres:
     def _stop_motors(self) -> bool:
         """Stop the motors, and return whether the vehicle confirms it; its null setpoints take over then."""
         return stop_until_confirmed(self._loop, lambda: _ask(self._loop, commands.stop()))
+
+
+def _go_to_end_of(stop: NDArray) -> bytes:
+    """Return the command to fly to where a stop, (M, 29) uint8, ends."""
+    last = decode(stop[-1:].reshape(-1, PAYLOAD_SIZE))
+    (x, y, z), yaw = last.position[0].tolist(), yaw_of(tuple(last.quaternion[0].tolist()))
+    return commands.go_to(x, y, z, yaw, STOP_DURATION)

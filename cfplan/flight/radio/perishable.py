@@ -1,21 +1,31 @@
-"""Packets waiting for a polled radio; setpoints and poses expire, as a vehicle treats every one as new.
+"""Packets waiting for a polled radio; setpoints, poses and some commands expire, as a vehicle treats every one as new.
 
 A Crazyradio repeats the packet in the air until it is acknowledged, and one more waits behind it. A radio that was dead
-would send both when it returns, and an old pose would set the vehicle's estimate back by the distance flown since.
-Therefore an expired packet is replaced by the next one, and in the air it is repeated as an empty packet.
+would send both when it returns. An old pose would set the vehicle's estimate back by the distance flown since, an old
+go-to would turn the vehicle back to a place that it has passed, and an old start would begin its trajectory later than
+the pilot expects. Therefore an expired packet is replaced by the next one, and in the air it is repeated as an empty
+packet.
 """
 
+from cfplan.flight.on_board.commands import GO_TO, START
 from cfplan.flight.radio.crtp import NULL_PACKET, Port
 from cfplan.flight.setpoints.packets import FULL_STATE_TYPE
 
 EXTERNAL_POSE = 8
-MAX_AGE = 0.05  # s, of setpoints and poses; even under heavy loss packets are acknowledged sooner
+MAX_AGE = 0.05  # s, of perishable packets; even under heavy loss packets are acknowledged sooner
+
+_PERISHABLE = (  # port, channel and first byte
+    (Port.SETPOINT, 0, FULL_STATE_TYPE),
+    (Port.LOCALIZATION, 1, EXTERNAL_POSE),
+    (Port.HIGH_LEVEL, 0, GO_TO),
+    (Port.HIGH_LEVEL, 0, START),
+)
 
 
 def is_perishable(packet: bytes) -> bool:
-    """Return whether a packet is a full-state setpoint or a pose."""
+    """Return whether a packet is a full-state setpoint, a pose, a go-to, or the start of a trajectory."""
     kind = packet[0] >> 4, packet[0] & 3, packet[1] if len(packet) > 1 else -1
-    return kind in ((Port.SETPOINT, 0, FULL_STATE_TYPE), (Port.LOCALIZATION, 1, EXTERNAL_POSE))
+    return kind in _PERISHABLE
 
 
 class Outbox:

@@ -13,6 +13,7 @@ from cflib.crtp.crtpstack import CRTPPacket
 from cflib.crtp.radiodriver import _RadioDriverThread
 from waiting import PATIENCE, until
 
+from cfplan.flight.on_board.commands import go_to, land, start
 from cfplan.flight.radio.crtp import Port, pack
 from cfplan.flight.radio.dongle import DEAD_AFTER, Dongle
 from cfplan.flight.radio.perishable import MAX_AGE, is_perishable
@@ -255,6 +256,9 @@ def test_a_packet_whose_acknowledgement_was_lost_is_neither_lost_nor_doubled(rad
     [
         (pose(1), True),
         (pack(Port.SETPOINT, 0, SETPOINT), True),
+        (pack(Port.HIGH_LEVEL, 0, go_to(0.0, 0.0, 1.0, 0.0, 1.0)), True),
+        (pack(Port.HIGH_LEVEL, 0, start()), True),
+        (pack(Port.HIGH_LEVEL, 0, land(0.0, 1.0)), False),
         (pack(Port.SETPOINT, 0, b"\0"), False),  # stop
         (pack(Port.SETPOINT, 1, bytes(5)), False),  # release priority
         (pack(Port.LOCALIZATION, 1, b"\x03"), False),  # emergency stop of older firmware
@@ -263,5 +267,5 @@ def test_a_packet_whose_acknowledgement_was_lost_is_neither_lost_nor_doubled(rad
         (pack(Port.LINK, 3, b""), False),  # nothing
     ],
 )
-def test_setpoints_and_poses_perish_and_nothing_else(sent, perishable):
+def test_setpoints_poses_go_tos_and_starts_perish_and_nothing_else(sent, perishable):
     assert is_perishable(sent) is perishable
