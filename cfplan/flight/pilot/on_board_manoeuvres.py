@@ -251,6 +251,9 @@ class OnBoardManoeuvres:
             return
         (x, y, z), _, yaw = loop.setpoint_now()
         self._begin_landing()
+        if not loop.stream.on_board:  # setpoints stopped it, and outrank its commander
+            self._land_by_setpoints()
+            return
         lowest = self._floor - (_BLIND_LANDING_DEPTH if loop.health.poses is GONE else _LANDING_DEPTH)
         way = max(z - lowest, 0.0)
         quick = math.sqrt(7.513 * way / _QUICK_DESCENT)  # the peak of a septic's acceleration is 7.513 way / duration²
@@ -262,13 +265,16 @@ class OnBoardManoeuvres:
             self._history.add_event(
                 Level.WARNING, f"the vehicle does not land: {_answer_text(answer)}; setpoints land it"
             )
-            landing = Landing(loop, self._floor)
-            landing.begun = True
-            landing.land()
+            self._land_by_setpoints()
             return
         end = loop.stream.end + _SETTLE_TIME
         loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > end, math.inf)
         self._end_landing()
+
+    def _land_by_setpoints(self) -> None:
+        landing = Landing(self._loop, self._floor)
+        landing.begun = True
+        landing.land()
 
     def _end_landing(self) -> None:
         """Stop the motors. Raises AbortRaised if they do not stop."""
