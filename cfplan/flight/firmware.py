@@ -125,16 +125,9 @@ def earlier_deviation(version: tuple[int, ...]) -> str:
 
 
 def version_of(text: str) -> tuple[int, ...]:
-    """Return the version in what a vehicle says of its firmware: "2025.09.1 (abc)" is (2025, 9, 1), "" is ().
-
-    A build with commits since a release, "2026.08 +37", is (2026, 8, 0, 37), newer than the release.
-    """
-    found = re.search(r"(\d+(?:\.\d+)*)(?: ?[+-](\d+))?", text)
-    if not found:
-        return ()
-    release = tuple(int(part) for part in found[1].split("."))
-    commits = int(found[2] or 0)
-    return (*release, *(0,) * (3 - len(release)), commits) if commits else release
+    """Return the version in what a vehicle says of its firmware: "2025.09.1 (abc)" is (2025, 9, 1), "" is ()."""
+    found = re.search(r"\d+(?:\.\d+)*", text)
+    return tuple(int(part) for part in found[0].split(".")) if found else ()
 
 
 def version_text(version: tuple[int, ...]) -> str:

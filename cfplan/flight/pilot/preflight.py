@@ -1,6 +1,7 @@
 """Preflight: the table of checks before arming, each a small function with a value, a threshold and a verdict."""
 
 import math
+import re
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from cfplan.vehicle.rotations import tilt_of, yaw_of
 OLDEST_PROTOCOL = 8  # the first with the go-to command that cfplan sends
 LARGEST_VARIANCE = 1e-3  # m², a standard deviation of 3 cm
 LARGEST_ROUND_TRIP = 0.05  # s
+_COMMITS_SINCE = re.compile(r"\d ?[+-][1-9]")  # a build after a release, as "2026.08 +37"
 _WAY_STEP = 0.01  # m between the checked places on the way to the start
 LARGEST_HEIGHT = 0.3  # m, of the tracked body above the floor: the vehicle may stand on a box
 LARGEST_TILT = math.radians(5.0)  # of the tracked body on the floor: floors are flatter
@@ -79,8 +81,11 @@ def check_firmware(snapshot: PreflightSnapshot) -> Check:
 def firmware_check(firmware: str, limits: Limits) -> Check:
     """Compare the version with the oldest and the newest that may fly; how a newer one behaves is unknown."""
     oldest, newest, found = limits.firmware.oldest, limits.firmware.newest, version_of(firmware)
-    if found > newest:
-        named = found if len(found) < 4 else (*found[:2], found[2] + 1)  # safety.yaml names releases
+    named = found
+    if found == newest and _COMMITS_SINCE.search(firmware):
+        year, month, patch = (*found, 0)[:3]
+        named = year, month, patch + 1  # the next release, as safety.yaml names only those
+    if named > newest:
         return Check(
             "firmware", firmware, "≤ " + version_text(newest), False,
             "time-outs and controller were read from older firmware: fly with that; or compare them, and write "

@@ -28,7 +28,6 @@ GAIN_TOLERANCE_OF_FIRMWARE = 0.05
 TRADED_GAIN_TOLERANCE = GAIN_TOLERANCE / (2.0 + GAIN_TOLERANCE)
 """The same for kR_xy and kw_xy, so that their ratio keeps its tolerance, which adds up to 1 cm."""
 MIN_ARMED_TIME = 5000  # ms, enough for arming with repeats and for take-off
-MAX_ARMED_TIME = 30_000  # ms, the default
 _FULL_COMMAND = 65535  # of one motor
 _FLOAT32_TOLERANCE = 1e-6  # relative, of a value that is read back: parameters are float32
 
@@ -223,9 +222,9 @@ PARAMETER_RULES: tuple[ParameterRule, ...] = (
         "restart the vehicle on a level floor and look at its console", optional=True,
     ),
     ParameterRule(
-        "supervisor.prefltTimeout", _always((MIN_ARMED_TIME, MAX_ARMED_TIME)),
-        f"from {MIN_ARMED_TIME} to {MAX_ARMED_TIME} ms", Action.REFUSED,
-        "An armed vehicle that does not take off in this time disarms itself, also where its link is lost.",
+        "supervisor.prefltTimeout", _always((MIN_ARMED_TIME, math.inf)), f"at least {MIN_ARMED_TIME} ms",
+        Action.REFUSED,
+        "An armed vehicle that does not take off in this time disarms itself.",
         _RESTART, since=(2025, 2), optional=True,
     ),
     ParameterRule(
