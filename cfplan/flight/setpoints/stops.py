@@ -3,10 +3,13 @@
 From the setpoint that is due, the clock of the trajectory runs slower and slower until it stands: the vehicle brakes
 on the path itself, where it was certified to be, and ends level at rest. With r the rate of that clock,
 
-    v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and heading,   body rates from the turn between attitudes.
+    v = r v₀,   a = r² a₀ + ṙ v₀,   attitude from a + g and planned yaw,   body rates from the turn between attitudes.
 
 r falls as a quintic smoothstep, so the braking deceleration is at most 1.875 v₀ / duration, and begins from nothing. A
 stop that begins at once, or is shorter, turns the vehicle so fast that link loss within it ends outside the walls.
+
+Yaw is that of the Hopf fibration, as in plans: the Euler yaw of a leaning attitude differs from it by degrees, and a
+vehicle that stopped often would turn away.
 """
 
 import math
@@ -20,8 +23,6 @@ from cfplan.flight.setpoints.encoding import (
     LEADING_WEIGHT,
     RATE_LEAD,
     THRUST_LEAD,
-    attitude_rows,
-    command_quaternion,
     encode_motion,
 )
 from cfplan.flight.setpoints.packets import PAYLOAD_SIZE, FullStateSetpoints, arrays_of
@@ -29,7 +30,7 @@ from cfplan.flight.setpoints.rate_trade import FIRMWARE_GAINS, AttitudeGains, ah
 from cfplan.machine_code import njit
 from cfplan.safety.space import Space
 from cfplan.vehicle.airframe import GRAVITY
-from cfplan.vehicle.rotations import quaternion_of, yaw_of
+from cfplan.vehicle.rotations import hopf_quaternion, yaw_of
 
 DURATION = 1.2  # s, from full speed to rest: 3.1 m/s² from 2 m/s on top of the turn's own
 _GRAVITY = np.array([0.0, 0.0, GRAVITY])
@@ -88,7 +89,8 @@ def stop_motion(
     With it comes the acceleration of each row BRAKE_LEAD later, (K · M, 3). Body rates and the length of the thrust
     vector have the leads, s, of the setpoints of a plan.
     """
-    yaw = np.unwrap(yaw_of(command_quaternion(motion.quaternion).T))
+    *_, z, w = motion.quaternion.T
+    yaw = np.unwrap(2.0 * np.arctan2(z, w))  # of the Hopf fibration
     *fields, acceleration = _stop_rows(
         arrays_of(motion),
         np.array(yaw, dtype=float),
@@ -121,7 +123,7 @@ def _stop_rows(
 ) -> _Rows:
     """Return position, velocity, acceleration as sent, attitude, body rate, and acceleration, (K, M, …), of K stops.
 
-    `motion` are the fields of N setpoints, and `yaw`, (N,) rad, is the one that the controller reads from each.
+    `motion` are the fields of N setpoints, and `yaw`, (N,) rad, is that of each in the Hopf fibration.
     `clock`, (3, M), is the time elapsed along the motion, in rows, its rate, and how that rate changes, 1/s. `leads`
     are those of rates and of thrust, in rows.
     """
@@ -143,10 +145,11 @@ def _stop_rows(
                 places[k, m, i] = position[row, i] + between * (position[after, i] - position[row, i])
                 speeds[k, m, i] = clock[1, m] * speed
                 made[k, m, i] = clock[1, m] ** 2 * along + clock[2, m] * speed
-            turn = yaw[row] + between * (yaw[after] - yaw[row])
+            half = 0.5 * (yaw[row] + between * (yaw[after] - yaw[row]))
             a, b, c = made[k, m, 0], made[k, m, 1], made[k, m, 2] + GRAVITY
             thrust[m] = math.sqrt(a * a + b * b + c * c)
-            attitude = quaternion_of(attitude_rows((a, b, c), (math.cos(turn), math.sin(turn))))
+            axis = a / thrust[m], b / thrust[m], c / thrust[m]
+            attitude = hopf_quaternion(axis, math.cos(half), math.sin(half))
             attitudes[k, m, 0], attitudes[k, m, 1], attitudes[k, m, 2], attitudes[k, m, 3] = attitude
         for m in range(length):
             periods = 1.0 if m == 0 or m == length - 1 else 2.0

@@ -1,13 +1,16 @@
 """Stops: on the path, ending at rest, and true to their own accelerations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from cfplan.flight.setpoints.encoding import RATE_LEAD, command_quaternion, controller_attitude
 from cfplan.flight.setpoints.level_out import UNTIL_WATCHDOG
 from cfplan.flight.setpoints.packets import FullStateSetpoints, decode
-from cfplan.flight.setpoints.stops import encode_stops, stop_motion
+from cfplan.flight.setpoints.stops import encode_stops, rest_behind, stop_motion
 from cfplan.vehicle.airframe import GRAVITY
+from cfplan.vehicle.rotations import hopf_quaternion, yaw_of
 
 
 @pytest.fixture
@@ -49,6 +52,18 @@ def test_a_stop_begins_where_the_setpoint_was(circle):
         assert first.position[0] == pytest.approx(circle.position[row], abs=1e-3)
         assert first.velocity[0] == pytest.approx(circle.velocity[row], abs=1e-3)
         assert stop_from(circle, row).acceleration[0] == pytest.approx(circle.acceleration[row], abs=1e-9)
+
+
+def test_a_stop_from_a_leaning_attitude_keeps_the_planned_yaw(circle):
+    """Euler yaw of that attitude differs by degrees, and a vehicle that stopped often would turn away."""
+    force = circle.acceleration + np.array([0.0, 0.0, GRAVITY])
+    axis = tuple((force / np.linalg.norm(force, axis=1, keepdims=True)).T)
+    leaning = np.stack(hopf_quaternion(axis, np.cos(0.25), np.sin(0.25)), axis=1)
+    motion = replace(circle, quaternion=leaning)
+    assert np.abs(yaw_of(leaning.T) - 0.5).max() > 0.01
+    assert np.abs(np.sum(stop_from(motion, 57).quaternion[0] * leaning[57])) == pytest.approx(1.0, abs=1e-12)
+    for row in range(0, 300, 50):
+        assert rest_behind(motion, row, 100.0)[1] == pytest.approx(0.5, abs=1e-12)
 
 
 def test_velocity_and_acceleration_are_the_derivatives_of_position(circle):
