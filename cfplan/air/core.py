@@ -17,12 +17,13 @@ from cfplan.air.replanning import answer_request, next_part
 from cfplan.air.requests import AnswerTimes, PathAnswer, PathRequest, PathVerdict, Wish
 from cfplan.air.timeline import Replanned, Timeline
 from cfplan.errors import CfplanError
-from cfplan.flight.pilot.proposals import LOOKS_UNTIL
+from cfplan.flight.pilot.proposals import LOOKS_UNTIL, NEXT_PART_TIMEOUT
 from cfplan.flight.setpoints.commitment import LEAST_AHEAD, Fault, Proposal, spliced
 from cfplan.flight.setpoints.encoding import RATE
 from cfplan.safety.limits import Limits
 
 NOT_FLOWN = "the plan is not flown yet"
+NO_NEXT_PART = f"the next part of the plan was not ready after {NEXT_PART_TIMEOUT:g} s of rest"
 NO_ANSWER = "the pilot does not answer; where it still accepts what was proposed last, that is flown"
 ON_ITS_WAY = "the vehicle is there, or on its way there already"
 PILOT_ANSWER_TIMEOUT = 1.0  # s to wait for the pilot's answer; a later answer still counts
@@ -186,6 +187,9 @@ def step(state: CoreState, events: Sequence[Event], now: float, limits: Limits) 
     for event in events:
         state, more = _after(state, event, now, limits)
         effects += more
+    if _rests_too_long(state, now):
+        state, more = _cut_short(state, NO_NEXT_PART, limits, going_on=False)
+        effects += more
     state, more = _next(state, now)
     return state, effects + more
 
@@ -247,6 +251,12 @@ def _wants_more(state: CoreState, now: float) -> bool:
     return timeline.part_ends is None or timeline.part_ends < state.first(now, state.ahead("part") + within)
 
 
+def _rests_too_long(state: CoreState, now: float) -> bool:
+    """Return whether the vehicle rests before the end of its plan for so long that a finishing pilot lands it."""
+    timeline = state.timeline
+    return timeline.unfinished and now >= state.begun + timeline.commitment.last / RATE + NEXT_PART_TIMEOUT
+
+
 def _next_part_is_urgent(state: CoreState, now: float) -> bool:
     """Return whether the next part must be planned before a waiting request, so as to be in time."""
     ends = state.timeline.part_ends
@@ -260,7 +270,7 @@ def _made(
     match result:
         case str():
             if job.request is None:
-                return _cut_short(state, result, limits)
+                return _cut_short(state, result, limits, going_on=state.timeline.part_ends is not None)
             return state, [
                 Tell(PathAnswer(job.request.number, PathVerdict.REFUSED, result, seconds=now - job.received))
             ]
@@ -289,7 +299,7 @@ def _answered(
         if answer.reason.startswith(Fault.LATE):
             return _late(state, job, answer.reason, now)
         if job.request is None:
-            return _cut_short(state, answer.reason, limits)
+            return _cut_short(state, answer.reason, limits, going_on=state.timeline.part_ends is not None)
         refused = PathAnswer(job.request.number, PathVerdict.REFUSED, answer.reason, seconds=now - job.received)
         return state, [Tell(refused)]
     due = math.floor((now - state.begun) * RATE)  # the pilot looked a little earlier
@@ -320,12 +330,12 @@ def _late(state: CoreState, job: Job, reason: str, now: float) -> tuple[CoreStat
     return _begin(state, job.request, job.received, now, ahead, job.tries + 1)
 
 
-def _cut_short(state: CoreState, reason: str, limits: Limits) -> tuple[CoreState, list[Effect]]:
+def _cut_short(state: CoreState, reason: str, limits: Limits, *, going_on: bool) -> tuple[CoreState, list[Effect]]:
     """End the motion at rest behind the committed part, because the next part failed.
 
-    The vehicle goes on from there, unless it was the plan from there that failed.
+    With `going_on` the vehicle goes on from there, unless it was the plan from there that failed.
     """
-    timeline = state.timeline.cut_short(limits, going_on=state.timeline.part_ends is not None)
+    timeline = state.timeline.cut_short(limits, going_on=going_on)
     state = replace(state, timeline=timeline)
     if timeline.unfinished:
         return state, []

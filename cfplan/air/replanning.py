@@ -152,7 +152,10 @@ def next_part(timeline: Timeline, splice: int, limits: Limits, part: int) -> Rep
         ahead = timeline.part_ends - 1  # all before it is committed already
         with suppress(EndsBadlyError, NotCertifiedError):
             made = certify_beginning(timeline.onward(ahead, timeline.motion), part, limits, foresee=False)
-            proposal = propose(timeline.commitment, ahead, made.payloads, made.stops, made.ending, goes_on=True)
+            proposal = propose(
+                timeline.commitment, ahead, made.payloads, made.stops, made.ending,
+                goes_on=True, unfinished=made.following is not None,
+            )  # fmt: skip
             return Replanned(proposal, timeline.with_certified(ahead, made), None, joint_of(ahead))
         with suppress(InfeasibleError, NotCertifiedError):  # the sooner it slows down the better
             return _search(timeline, min(splice + SLOWDOWN_MARGIN, ahead), rest_of_it, limits, slower=True)
@@ -219,7 +222,8 @@ def _replan_at(timeline: Timeline, splice: int, spec: ReplanSpec, limits: Limits
     passed = certify_whole(onward, limits) if part is None else certify_beginning(onward, part, limits)
     motion = timeline.motion.continued(joint, made.plan.trajectory)
     later = replace(timeline, motion=motion, ahead=points, reached=made.reached).with_certified(splice, passed)
-    proposal = propose(timeline.commitment, splice, passed.payloads, passed.stops, passed.ending)
+    unfinished = passed.following is not None
+    proposal = propose(timeline.commitment, splice, passed.payloads, passed.stops, passed.ending, unfinished=unfinished)
     return Replanned(proposal, later, made.plan, joint)
 
 

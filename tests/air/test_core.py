@@ -4,12 +4,14 @@ import math
 from collections import Counter
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfplan.air.core import (
     NO_ANSWER,
+    NO_NEXT_PART,
     NOT_FLOWN,
     PILOT_ANSWER_TIMEOUT,
     Answered,
@@ -24,6 +26,7 @@ from cfplan.air.core import (
 )
 from cfplan.air.requests import PathRequest, PathVerdict, Wish
 from cfplan.air.timeline import Replanned, hold_hover
+from cfplan.flight.pilot.proposals import NEXT_PART_TIMEOUT
 from cfplan.flight.setpoints.commitment import Fault, propose, spliced
 from cfplan.flight.setpoints.encoding import RATE
 
@@ -167,6 +170,23 @@ def test_while_the_pilot_does_not_answer_requests_are_refused_and_what_it_accept
     flight.make()
     flight.answer()
     assert flight.told[-1].verdict is PathVerdict.ACCEPTED
+
+
+def test_a_plan_whose_next_part_never_comes_in_time_is_cut_short_before_a_finishing_pilot_lands(flight):
+    left = replace(flight.state.timeline, left=np.array([[0.5, 0.5, 1.0]]))
+    flight.state = replace(flight.state, timeline=left, accepted=7)
+    rests = flight.now + left.commitment.last / RATE
+    flight.take()
+    while flight.now < rests + NEXT_PART_TIMEOUT:
+        assert not flight.told
+        flight.now += 0.1
+        flight.make()
+        if flight.proposals:
+            flight.answer(Fault.LATE.value)
+    assert [(answer.number, answer.verdict, answer.reason) for answer in flight.told] == [
+        (7, PathVerdict.CUT_SHORT, NO_NEXT_PART)
+    ]
+    assert not flight.state.timeline.unfinished
 
 
 def test_how_far_ahead_is_planned_follows_how_long_plans_took(flight):

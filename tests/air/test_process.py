@@ -315,6 +315,10 @@ def test_of_the_stops_within_a_stop_only_that_is_sent(held, limits):
     payloads = np.repeat(good.payloads[-1:], len(stops), axis=0)
     few = replace(good, payloads=payloads, stops=stops, ending=len(stops) - 1).to_bytes()
     assert Proposal.of_bytes(few) is None  # it would ask for any memory
+    stops = np.broadcast_to(good.payloads[0], (900, 10_000, *good.payloads.shape[1:]))
+    long = replace(good, payloads=payloads[:900], stops=stops, ending=899).to_bytes()
+    assert len(long) < 1e6
+    assert Proposal.of_bytes(long) is None
 
 
 def test_what_is_committed_far_ahead_of_the_vehicle_is_replaced_from_near(both):

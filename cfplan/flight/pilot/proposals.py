@@ -13,6 +13,7 @@ from cfplan.flight.clock import REAL_CLOCK, Clock
 from cfplan.flight.setpoints.commitment import Commitment, Proposal, Refusal
 
 LONGEST_MESSAGE = 1 << 26  # bytes, of a proposal: five minutes of flight
+NEXT_PART_TIMEOUT = 5.0  # s at rest before the end of a plan, after which its next part is not awaited any longer
 LOOKS_UNTIL = 0.003  # s before a setpoint is due: proposals that arrive later wait until it is sent
 # kind; checksums of proposal and commitment; time, s, of setpoint 0 or of the proposal's arrival
 _ANSWER = struct.Struct("<8sIId")

@@ -12,12 +12,13 @@ from cfplan.flight.pilot.health import Descent
 from cfplan.flight.pilot.landing import Landing, stop_motors
 from cfplan.flight.pilot.manoeuvres import Place, begin_take_off, climb, settle_at
 from cfplan.flight.pilot.mission import go_to_time
+from cfplan.flight.pilot.proposals import NEXT_PART_TIMEOUT
 from cfplan.flight.pilot.stream import Stream
 from cfplan.flight.setpoints.encoding import encode_motion
 from cfplan.flight.setpoints.hover_to_hover import hover_to_hover
 from cfplan.flight.setpoints.rate_trade import ahead, gains_under
 from cfplan.flight.setpoints.stops import encode_stops
-from cfplan.flight.telemetry import Phase
+from cfplan.flight.telemetry import Level, Phase
 
 BRAKE_HOLD = 1.0  # s of hover after a stop
 _FOLLOWS_WITHIN = 0.15  # m from its setpoint; a vehicle farther away stops from the nearest setpoint
@@ -71,10 +72,18 @@ class StreamedManoeuvres:
             loop.until(lambda: loop.now() > loop.plan.end, math.inf)
             self._history.skipped = loop.skipped - skipped
             self._history.enter(Phase.HOLD)
-            if not loop.until(lambda: loop.finishing or loop.now() < loop.plan.end, self._mission.hold_time):
+            if not loop.until(lambda: self._finished() or loop.now() < loop.plan.end, self._mission.hold_time):
                 break
-            if loop.finishing and loop.now() >= loop.plan.end:
+            if self._finished():
                 break
+        if loop.commitment.unfinished:
+            self._history.add_event(Level.WARNING, "the next part of the plan did not come: landing before its end")
+
+    def _finished(self) -> bool:
+        """Return whether the vehicle is to land here: it is finishing, and no next part of its plan is awaited."""
+        loop = self._loop
+        awaited = NEXT_PART_TIMEOUT if loop.commitment.unfinished else 0.0
+        return loop.finishing and loop.now() >= loop.plan.end + awaited
 
     def land(self) -> None:
         """Land by setpoints, and stop the motors."""

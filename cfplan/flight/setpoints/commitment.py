@@ -41,6 +41,7 @@ from cfplan.flight.setpoints.packets import (
     positions_of,
 )
 from cfplan.flight.setpoints.rate_trade import turns_for
+from cfplan.flight.setpoints.stops import DURATION
 from cfplan.safety.limits import Limits
 from cfplan.safety.space import inside
 from cfplan.vehicle.airframe import GRAVITY
@@ -49,7 +50,8 @@ from cfplan.vehicle.rotations import rotations_of, yaw_of
 LEAST_AHEAD = 0  # least setpoints from the one just sent to a splice; the first new one follows the splice
 FARTHEST_AHEAD = 6000  # most setpoints from the clock to a splice: a minute
 MOST_SETPOINTS = 4000  # of a proposal, 40 s; a planner proposes parts that are shorter. Bounds the time to verify it
-LONGEST_ENDING = 1000  # most unsent stops of a proposal, which bounds the memory for it
+LONGEST_ENDING = 1000  # most unsent stops of a proposal
+LONGEST_STOP = round(DURATION * RATE) + 1  # most setpoints of a stop; bounds the memory for unsent stops
 KEPT_BEHIND = 100  # setpoints kept before the one due, for a vehicle that fell behind
 QUANTUM = 1e-3  # m, m/s, m/s², rad/s: of the fields of a packet
 LEVEL = 0.01  # rad, largest tilt in hover: twice the rounding of an attitude
@@ -62,8 +64,8 @@ _ROUNDING = 1e-9
 _SAME_HEADING = 0.1  # rad; a stop and its setpoint trade different rates, which differ in heading by up to 0.02
 _MAGIC = b"proposal"
 _CHAIN = struct.Struct("<II")  # checksums of a commitment and of the proposal that continues it
-# magic, `follows`, checksum, splice, setpoints, setpoints per stop, stops sent, `goes_on`
-_HEAD = struct.Struct("<8sIIQIII?")
+# magic, `follows`, checksum, splice, setpoints, setpoints per stop, stops sent, `goes_on`, `unfinished`
+_HEAD = struct.Struct("<8sIIQIII??")
 
 
 class Fault(StrEnum):
@@ -105,6 +107,7 @@ class Commitment:
     stops: NDArray  # (N, M, 29) uint8
     splices: tuple[int, ...] = ()  # numbers of the first setpoints of plans made in the air
     checksum: int = -1  # of its whole history; -1: compute it from the arrays
+    unfinished: bool = False  # whether it ends before its plan does: the planner is to propose the next part
 
     def __post_init__(self) -> None:
         if wrong := _wrong_shape(self.first, self.payloads, self.stops):
@@ -137,11 +140,13 @@ class Proposal:
     checksum: int  # of splice, payloads and stops
     ending: int = 0  # number of last stops that are the remainder of the stop before them, see left_of()
     goes_on: bool = False  # whether it is the next part of the present plan, which is not announced
+    unfinished: bool = False  # whether it ends before its plan does
 
     def to_bytes(self) -> bytes:
         """Return the proposal as a message to the pilot's process, kept short as copying costs milliseconds."""
         sent = len(self.stops) - self.ending
-        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *self.stops.shape[:2], sent, self.goes_on)
+        shape, flags = self.stops.shape[:2], (self.goes_on, self.unfinished)
+        head = _HEAD.pack(_MAGIC, self.follows, self.checksum, self.splice, *shape, sent, *flags)
         return b"".join((head, self.payloads.tobytes(), self.stops[:sent].tobytes()))
 
     @classmethod
@@ -149,8 +154,8 @@ class Proposal:
         """Return the proposal in a message, unverified; None if there is none."""
         if len(message) < _HEAD.size or message[: len(_MAGIC)] != _MAGIC:
             return None
-        _, follows, checksum, first, count, length, sent, goes_on = _HEAD.unpack_from(message)
-        if not length or not 0 < sent <= count or count - sent > LONGEST_ENDING:
+        _, follows, checksum, first, count, length, sent, goes_on, unfinished = _HEAD.unpack_from(message)
+        if not 0 < length <= LONGEST_STOP or not 0 < sent <= count <= MOST_SETPOINTS or count - sent > LONGEST_ENDING:
             return None
         if len(message) != _HEAD.size + (count + sent * length) * PAYLOAD_SIZE:
             return None
@@ -158,7 +163,7 @@ class Proposal:
         stops, ending = rows[count:].reshape(sent, length, PAYLOAD_SIZE), count - sent
         if ending:
             stops = np.concatenate([stops, left_of(stops[-1], ending)])
-        return cls(follows, first, rows[:count], stops, checksum, ending, goes_on)
+        return cls(follows, first, rows[:count], stops, checksum, ending, goes_on, unfinished)
 
 
 def propose(
@@ -169,14 +174,15 @@ def propose(
     ending: int = 0,
     *,
     goes_on: bool = False,
+    unfinished: bool = False,
 ) -> Proposal:
     """Return a proposal of certified setpoints and stops that continue the commitment from `splice` on.
 
     `ending` is the number of last stops that are the remainder of the stop before them; `goes_on` marks the next part
-    of the present plan.
+    of the present plan, and `unfinished` one with more of its plan to follow.
     """
     checksum = checksum_of(splice, payloads, stops)
-    return Proposal(commitment.checksum, splice, payloads, stops, checksum, ending, goes_on)
+    return Proposal(commitment.checksum, splice, payloads, stops, checksum, ending, goes_on, unfinished)
 
 
 def left_of(stop: NDArray, count: int) -> NDArray:
@@ -242,6 +248,7 @@ def spliced(commitment: Commitment, proposal: Proposal, now: int) -> Commitment:
         stops,
         (*(one for one in commitment.splices if first <= one < proposal.splice), proposal.splice),
         zlib.crc32(_CHAIN.pack(commitment.checksum, proposal.checksum)),
+        proposal.unfinished,
     )
 
 
