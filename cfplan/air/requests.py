@@ -40,7 +40,7 @@ class PathRequest:
 
 @dataclass(frozen=True, slots=True)
 class AnswerTimes:
-    """Times of the steps until a request was accepted, s on the clock of time.monotonic()."""
+    """Times of the steps until a request was accepted, s on the flight's clock."""
 
     received: float  # the request
     begun: float  # planning; of a request whose first proposal came late, of the second
