@@ -94,7 +94,7 @@ def test_half_a_surrogate_pair_in_a_record_becomes_a_question_mark(tmp_path):
 def test_half_a_surrogate_pair_is_printed_as_json_escapes_it(capsys):
     print_json({"name": "half \ud800, °"})
     printed = capsys.readouterr().out
-    assert "°" in printed
+    assert printed.isascii()  # for any terminal
     assert json.loads(printed) == {"name": "half \ud800, °"}
 
 

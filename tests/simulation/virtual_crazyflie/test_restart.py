@@ -26,7 +26,7 @@ def test_a_restart_ends_a_lock_and_nothing_answers_meanwhile(make_rig):
     assert not rig.send(Port.LINK, 0, b"ping")
     assert switch(rig, SYSTEM_ON)
     assert not rig.send(Port.LINK, 0, b"ping")
-    rig.run(1.0)
+    rig.run(2.5)
     assert rig.send(Port.LINK, 0, b"ping")
     assert rig.state is State.CHECKS_PASSED
     assert rig.vehicle.firmware.parameters["stabilizer.controller"] == 1
