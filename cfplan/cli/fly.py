@@ -106,13 +106,14 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    flight_options = options.flight_options(planning, safety_file, path_or_plan)
+    options.refuse_new_plan(path_or_plan)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared
         with steps.waiting("loading planners and simulator"):
             from cfplan.cli.confirm import confirmed
             from cfplan.cli.recorded_flight import fly_and_record
+        flight_options = options.flight_options(planning, safety_file, path_or_plan)
         flight = _preparation(on_board, after, uri)(path_or_plan, limits, flight_options, steps)
         if not confirmed({uri: flight}, flight.planned.name, records, yes=yes):
             return int(ExitCode.ENDED_BY_OPERATOR)

@@ -14,6 +14,7 @@ from click.core import ParameterSource
 from cfplan.cli.output import VERBOSE, short_path
 from cfplan.errors import InputError
 from cfplan.files.nearest import nearest
+from cfplan.files.suffixes import PLAN_SUFFIX
 
 if TYPE_CHECKING:
     from cfplan.cli.output import Steps
@@ -202,15 +203,20 @@ def refuse(names: Collection[str], what: str, hint: str) -> None:
             raise InputError(what, where=max(parameter.opts, key=len), hint=hint)
 
 
+def refuse_new_plan(path_or_plan: Path) -> None:
+    """Raise InputError if an option would change the plan of a plan file."""
+    if path_or_plan.suffix == PLAN_SUFFIX:
+        refuse(PLANNING, "a plan file is flown as it was planned", "plan the path again with this option")
+
+
 def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
     """Return the options of planning() with the folders of models.
 
     Raises InputError if there is no such model, or for an option that would change the plan of a plan file.
     """
-    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions
+    from cfplan.preparation.plan_flight import FlightOptions
 
-    if path_file.suffix == PLAN_SUFFIX:
-        refuse(PLANNING, "a plan file is flown as it was planned", "plan the path again with this option")
+    refuse_new_plan(path_file)
     rest = {name: value for name, value in planning.items() if name != "model"}
     model: Path | None = planning["model"]
     if model is not None and not (model / "card.json").is_file():

@@ -99,7 +99,7 @@ def _check_files(output: Path | None, figure: Path | None, force: bool) -> None:
         check_figure_file(figure, overwrite=force)
     if output is None:
         return
-    from cfplan.preparation.plan_flight import PLAN_SUFFIX
+    from cfplan.files.suffixes import PLAN_SUFFIX
 
     if output.suffix != PLAN_SUFFIX:
         raise InputError(

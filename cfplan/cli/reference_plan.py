@@ -25,7 +25,8 @@ def reference_plan(source: Path, safety_file: Path | None, steps: "Steps") -> "R
 
     Raises InputError if a file is wrong, InfeasibleError if no profile keeps the limits of motion.
     """
-    from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, plan_flight
+    from cfplan.files.suffixes import PLAN_SUFFIX
+    from cfplan.preparation.plan_flight import FlightOptions, plan_flight
     from cfplan.recording.overlay import reference_of
     from cfplan.recording.record import PLAN_FILE
 

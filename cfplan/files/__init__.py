@@ -4,4 +4,4 @@ And schemas of files that are read into dataclasses; where files are: the neares
 with cfplan, and atomic writing of new ones.
 """
 
-__all__ = ["atomic", "json_values", "nearest", "schema", "shipped", "text", "yaml_with_places"]
+__all__ = ["atomic", "json_values", "nearest", "schema", "shipped", "suffixes", "text", "yaml_with_places"]

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
 from cfplan.files.atomic import atomic_output, write_atomically
+from cfplan.files.suffixes import PLAN_SUFFIX
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory, certified_compressed, certified_pieces
 from cfplan.flight.on_board.correction import correct
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
 from cfplan.numbers import shown
-from cfplan.preparation.plan_flight import PLAN_SUFFIX, FlightOptions, PlannedFlight, plan_flight
+from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
 from cfplan.safety.limits import Limits

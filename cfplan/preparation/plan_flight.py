@@ -10,6 +10,7 @@ import numpy as np
 
 from cfplan.deadline import NEVER, Deadline
 from cfplan.errors import InputError
+from cfplan.files.suffixes import PLAN_SUFFIX
 from cfplan.flight.setpoints.encoding import encode_trajectory
 from cfplan.flight.setpoints.rate_trade import gains_under
 from cfplan.geometry.path_file import PathFile, load_path_file
@@ -36,7 +37,6 @@ from cfplan.vehicle.trajectory import Trajectory
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PLAN_SUFFIX = ".parquet"
 _AT_REST = 1e-3  # m/s and m/s²
 
 

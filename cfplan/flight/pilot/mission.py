@@ -14,7 +14,7 @@ from cfplan.flight.telemetry import Triple
 from cfplan.safety.limits import SHORTEST_MANOEUVRE, Limits
 from cfplan.vehicle.rotations import yaw_of
 
-PEAK_RATE, PEAK_CHANGE = 35 / 16, 7.52  # of a polynomial of degree 7 from rest to rest, one unit in one second
+_PEAK_RATE, _PEAK_CHANGE = 35 / 16, 7.52  # of a polynomial of degree 7 from rest to rest, one unit in one second
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +76,8 @@ def go_to_time(distance: float, turn: float, limits: Limits) -> float:
     turn, plan = abs(math.remainder(turn, math.tau)), limits.plan
     return max(
         manoeuvre_time(distance, limits.ground.go_to_speed),
-        PEAK_RATE * turn / plan.angular_velocity,
-        math.sqrt(PEAK_CHANGE * turn / plan.angular_acceleration),
+        _PEAK_RATE * turn / plan.angular_velocity,
+        math.sqrt(_PEAK_CHANGE * turn / plan.angular_acceleration),
     )
 
 
