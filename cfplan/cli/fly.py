@@ -106,7 +106,6 @@ def fly(
     if path_or_plan is None or lines is not None:
         place = _source_of_waypoints(path_or_plan, lines, on_board, after)
         return fly_waypoints(place, safety_file, uri, mocap_uri, records, watched, yes=yes, as_json=as_json)
-    options.refuse_new_plan(path_or_plan)
     limits = options.read_limits(safety_file, path_or_plan, steps, compiled=True)
     look_at_hardware(uri, mocap_uri, limits.pose, steps)
     with StartingVehicle(uri, mocap_uri, limits) as vehicle:  # it starts while the flight is prepared

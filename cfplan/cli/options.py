@@ -203,20 +203,13 @@ def refuse(names: Collection[str], what: str, hint: str) -> None:
             raise InputError(what, where=max(parameter.opts, key=len), hint=hint)
 
 
-def refuse_new_plan(path_or_plan: Path) -> None:
-    """Raise InputError if an option would change the plan of a plan file."""
-    if path_or_plan.suffix == PLAN_SUFFIX:
-        refuse(PLANNING, "a plan file is flown as it was planned", "plan the path again with this option")
-
-
 def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path, **more: Any) -> "FlightOptions":
     """Return the options of planning() with the folders of models.
 
-    Raises InputError if there is no such model, or for an option that would change the plan of a plan file.
+    Raises InputError if there is no such model.
     """
     from cfplan.preparation.plan_flight import FlightOptions
 
-    refuse_new_plan(path_file)
     rest = {name: value for name, value in planning.items() if name != "model"}
     model: Path | None = planning["model"]
     if model is not None and not (model / "card.json").is_file():
@@ -229,8 +222,11 @@ def flight_options(planning: dict[str, Any], given: Path | None, path_file: Path
 def read_limits(given: Path | None, path_file: Path, steps: "Steps", *, compiled: bool = False) -> "Limits":
     """Find and read safety.yaml, as the first step of a command; `compiled` first compiles all that flights need.
 
-    Raises InputError if safety.yaml is wrong, or there is no path file.
+    Raises InputError if safety.yaml is wrong, if there is no path file, or for an option that would change the plan of
+    a plan file.
     """
+    if path_file.suffix == PLAN_SUFFIX:
+        refuse(PLANNING, "a plan file is flown as it was planned", "plan the path again with this option")
     if not path_file.exists():
         raise InputError("no such file", where=str(path_file), hint="check the name; it is relative to this folder")
     with steps.step("limits") as results:
