@@ -9,7 +9,7 @@ from slow_cases import slow_unless
 from stepped_flight import at_setpoint, fly_stepped
 
 from cfplan.errors import ExitCode, InfeasibleError, InputError, PreflightError
-from cfplan.flight.on_board.commands import GO_TO, LAND
+from cfplan.flight.on_board.commands import GO_TO, LAND, START
 from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, read_compressed, read_raw
 from cfplan.flight.pilot.keys import HeldOrders, Order
@@ -69,6 +69,12 @@ def compared(prepared):
     streamed = fly_stepped(mission_of(encode_flight(prepared.planned), prepared.mission.limits))
     assert on_board.outcome.reason == streamed.outcome.reason == "landed"
     return on_board.outcome.deviation.max, streamed.outcome.deviation.max
+
+
+def steepest(flight):
+    """The largest tilt in the air, rad."""
+    in_air = flight.truth.position[:, 2] > 0.3
+    return np.arccos(matrices_of(flight.truth.quaternion[in_air])[:, 2, 2]).max()
 
 
 def test_it_takes_off_flies_and_lands_by_its_own_commander(flown):
@@ -203,9 +209,39 @@ def test_it_stops_from_where_it_is_once_its_radio_returns(line, dead, order):
     flight = fly_stepped(line.mission, at_setpoint(row, strike), orders=orders, lab=lab)
     assert flight.outcome.rung is Rung.LAND
     assert flight.truth.off_in_air[-1] == 0
-    in_air = flight.truth.position[:, 2] > 0.3
-    tilt = np.degrees(np.arccos(matrices_of(flight.truth.quaternion[in_air])[:, 2, 2]))
-    assert tilt.max() < np.degrees(LIMITS.flight.stop_tilt)
+    assert steepest(flight) < LIMITS.flight.stop_tilt
+
+
+@pytest.mark.parametrize("command", [GO_TO, START])
+@pytest.mark.parametrize("arrives", [False, True])
+@pytest.mark.parametrize("dead", [0.35, 0.7, 0.9])
+def test_a_radio_that_dies_with_a_command_to_fly_on_leaves_no_doubt_of_what_it_flies(line, command, arrives, dead):
+    lab, struck = SteppedLab(LIMITS.airframe), []
+    send, receive = lab.radio.send, lab.vehicle.firmware.planner.receive
+
+    def strike(sent):
+        if sent == command and not struck:
+            struck.append(sent)
+            lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, dead))
+
+    def strike_before(packet):
+        strike(packet[1] if (packet[0] >> 4, packet[0] & 3) == (Port.HIGH_LEVEL, 0) else None)
+        return send(packet)
+
+    def strike_after(payload, *rest, **more):
+        answer = receive(payload, *rest, **more)
+        strike(payload[0])
+        return answer
+
+    if arrives:
+        lab.vehicle.firmware.planner.receive = strike_after
+    else:
+        lab.radio.send = strike_before
+    flight = fly_stepped(line.mission, lab=lab)
+    assert struck
+    assert flight.outcome.rung is (Rung.NONE if dead < 0.4 else Rung.LAND)
+    assert flight.truth.off_in_air[-1] == 0
+    assert steepest(flight) < LIMITS.flight.stop_tilt
 
 
 @pytest.mark.parametrize("command", [LAND, GO_TO])

@@ -160,13 +160,14 @@ class FlightLoop:
 
     # The stream.
 
-    def begin(self, stream: Stream) -> Stream:
+    def begin(self, stream: Stream, commanded: float | None = None) -> Stream:
         """Send this stream from the next deadline on; return it with its start.
 
-        A stream that is flown on board begins when the command just sent has arrived and the commander polls for it,
-        half a period later on average.
+        A stream that is flown on board begins when the command, sent at `commanded`, s, or just now, has arrived and
+        the commander polls for it, half a period later on average.
         """
-        arrived = self.now() + 0.5 * self.link.round_trip + 0.5 / stream.rate
+        sent = self.now() if commanded is None else commanded
+        arrived = sent + 0.5 * self.link.round_trip + 0.5 / stream.rate
         self.stream = stream.starting_at(arrived if stream.on_board else self._deadlines.upcoming)
         self._begun.append(self.stream)
         return self.stream
@@ -176,9 +177,9 @@ class FlightLoop:
         """Return whether the vehicle flies in a fleet."""
         return self._conductor is not NO_CONDUCTOR
 
-    def begin_plan(self) -> None:
-        """Send the plan from the next deadline on."""
-        self.plan = self.begin(self.plan)
+    def begin_plan(self, commanded: float | None = None) -> None:
+        """Send the plan from the next deadline on; on board it began as `begin` says."""
+        self.plan = self.begin(self.plan, commanded)
         self.history.first_setpoint = self.plan.start
         self._proposals.begin(self.plan.start)
 

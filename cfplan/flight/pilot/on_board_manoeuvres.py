@@ -8,6 +8,7 @@ keep-alive packet.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,15 +65,10 @@ def upload_program(loop: FlightLoop, program: OnBoardProgram) -> None:
     loop.history.add_event(Level.INFO, f"{program.pieces} pieces in {len(program.memory)} bytes uploaded and read back")
 
 
-def _ask(
-    loop: FlightLoop,
-    command: bytes,
-    sent: Callable[[], object] = lambda: None,
-    taken: Callable[[], bool] = lambda: False,
-) -> int | None:
+def _ask(loop: FlightLoop, command: bytes, sent: Callable[[], object] = lambda: None) -> int | None:
     """Send a command until it is answered, and return the answer; None if there is none.
 
-    `sent` is called at each sending. A command that was `taken` according to the vehicle's log is not sent again.
+    `sent` is called at each sending.
     """
     number = command[0]
     for attempt in range(ATTEMPTS):
@@ -81,7 +77,7 @@ def _ask(
         sent()
         loop.until(lambda: number in loop.link.replies, ANSWER_TIMEOUT)
         answer = loop.link.replies.get(number)
-        if taken() or (attempt and answer == commands.BUSY):  # the first one arrived, its answer did not
+        if attempt and answer == commands.BUSY:  # the first one arrived, its answer did not
             return commands.DONE
         if answer is not None:
             return answer
@@ -93,6 +89,15 @@ def _answer_text(answer: int | None) -> str:
     return "it does not answer" if answer is None else commands.ANSWERS.get(answer, f"it answers {answer}")
 
 
+@dataclass(frozen=True, slots=True)
+class _Departure:
+    """A command to fly on, until the vehicle is known to have taken it or not."""
+
+    number: int
+    sent: float  # s
+    begin: Callable[[float], object]  # begins what it flies then, given `sent`
+
+
 class OnBoardManoeuvres:
     """Lets the vehicle's commander fly a mission's phases."""
 
@@ -100,6 +105,7 @@ class OnBoardManoeuvres:
         self._loop, self._floor, self._program = loop, floor, program  # m, height of the tracked body before take-off
         self._mission, self._limits, self._history = loop.mission, loop.limits, loop.history
         self._stops = list[tuple[float, NDArray]]()  # commanded: s, when sent; (M, 29) uint8, the stop as setpoints
+        self._departure: _Departure | None = None
         self._landing = False  # the last descent has begun
 
     def take_off(self) -> None:
@@ -126,7 +132,7 @@ class OnBoardManoeuvres:
         start = self._program.begin
         duration = go_to_time(math.dist(loop.pose().position, start[:3]), start[3] - yaw, self._limits)
         way = self._way((x, y, z, yaw), start, duration)
-        self._require(_ask(loop, commands.go_to(*start, duration), lambda: loop.begin(way)), "go to the start")
+        self._depart(commands.go_to(*start, duration), lambda sent: loop.begin(way, sent), "go to the start")
         assert loop.stream is not None
         end = loop.stream.end
         loop.until(lambda: loop.now() > end, math.inf)
@@ -137,13 +143,7 @@ class OnBoardManoeuvres:
         loop = self._loop
         loop.await_clearance(Phase.STREAM)
         self._history.enter(Phase.STREAM)
-        begun = loop.now()
-
-        def flies() -> bool:
-            status = loop.link.status
-            return status is not None and status.time > begun and not loop.bits(TRAJECTORY_FINISHED)
-
-        self._require(_ask(loop, commands.start(), loop.begin_plan, flies), "start the trajectory")
+        self._depart(commands.start(), loop.begin_plan, "start the trajectory")
         self._history.add_event(Level.INFO, "the vehicle flies the trajectory on board")
         loop.until(lambda: loop.now() > loop.plan.start + loop.motion_ends, math.inf)
         self._history.enter(Phase.HOLD)
@@ -170,10 +170,44 @@ class OnBoardManoeuvres:
         self._stop()
         self._descend()
 
-    def _require(self, answer: int | None, what: str) -> None:
-        """Raise AbortRaised unless the vehicle accepted the command."""
+    def _depart(self, command: bytes, begin: Callable[[float], object], what: str) -> None:
+        """Command the vehicle to fly on from its hover, and `begin` the reference once it has taken the command.
+
+        A command that it has not taken has perished by then, and is sent again. Raises AbortRaised if it refuses.
+        """
+        loop, number = self._loop, command[0]
+        for _ in range(ATTEMPTS):
+            loop.link.replies.pop(number, None)
+            loop.link.command(command)
+            self._departure = _Departure(number, loop.now(), begin)
+            answer = self._answer_to_departure()
+            if answer is not None:
+                break
         if answer != commands.DONE:
             raise AbortRaised(AbortReason.COMMAND_FAILED.abort(Rung.LAND, command=what, answer=_answer_text(answer)))
+
+    def _answer_to_departure(self) -> int | None:
+        """Wait until the vehicle answers the command to fly on, or its log shows whether it does; begin the reference.
+
+        Returns None if neither shows that it does. An abort may interrupt the wait, which `_stop` resumes.
+        """
+        loop, departure = self._loop, self._departure
+        if departure is None:
+            return None
+
+        def answer() -> int | None:
+            return loop.link.replies.get(departure.number)
+
+        def logged() -> bool:
+            return loop.status is not None and loop.status.time > departure.sent + MAX_AGE
+
+        loop.until(lambda: answer() is not None or logged() or loop.health.status_unknown, math.inf)
+        self._departure = None
+        flies = answer() is None and logged() and not loop.bits(TRAJECTORY_FINISHED)
+        if flies or answer() == commands.DONE:
+            departure.begin(departure.sent)
+            return commands.DONE
+        return answer()
 
     def _way(self, begin: tuple[float, ...], end: tuple[float, ...], duration: float) -> Stream:
         """Return what the commander flies from hover to hover, m and rad, as setpoints, with a stop from each."""
@@ -199,6 +233,7 @@ class OnBoardManoeuvres:
 
     def _stop(self) -> None:
         """Let the commander brake to a hover where it was certified to, or finish a stop that has begun."""
+        self._answer_to_departure()
         loop, left = self._loop, self._loop.stream
         if left is None or self._landing:
             return
