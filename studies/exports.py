@@ -1,14 +1,16 @@
 """Export each PATH for the vehicle's memory, fly it on board, and compare deviations with those of streaming the plan.
 
-Exports are flown in the dry run; the pilot flies on-board plans on the stepped lab's virtual Crazyflie.
+Exports are flown in the dry run; the pilot flies on-board plans on the stepped lab's virtual Crazyflie. Vehicles have
+firmware that reads the yaw of compressed pieces.
 """
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from cfplan.errors import CfplanError
+from cfplan.flight.on_board.memory_format import YAW_READ_SINCE
 from cfplan.flight.pilot.mission import Mission, mission_of
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.preparation.export_flight import Form, fit_polynomials, plan_for_polynomials
@@ -95,6 +97,7 @@ def measure(path_file: Path) -> list[OnBoard]:
     A failure to plan, fit or prepare becomes a row with its reason. Raises what reading the limits raises.
     """
     limits, rows = limits_for(path_file), []
+    limits = replace(limits, firmware=replace(limits.firmware, oldest=YAW_READ_SINCE))
     for what, fly in (("exports", _exported), ("on-board", _flown)):
         try:
             rows.append(fly(path_file, limits))

@@ -38,7 +38,9 @@ Examples:
 )
 @click.option("--plain", is_flag=True, help="Export the plan's motion without corrections for the firmware.")
 @click.option(
-    "--pieces", type=click.IntRange(1, 255), help="Maximum number of pieces.  [default: 31, as a vehicle holds]"
+    "--pieces",
+    type=click.IntRange(2, 255),
+    help="Maximum number of uncompressed pieces.  [default: 31, as a vehicle holds]",
 )
 @click.option(
     "--rate", type=options.FiniteRange(1, 1000), default=100.0, show_default=True, help="Rate of samples, Hz."
@@ -96,12 +98,16 @@ def _check_options(form: str, pieces: int | None) -> None:
         options.refuse(("plain", "pieces"), "samples are those of the plan, not of polynomials", "leave it out")
     else:
         options.refuse(("rate",), f"{form} has no samples", "leave it out, or choose --to samples")
+    if form == "compressed":
+        options.refuse(("pieces",), "as many compressed pieces are written as the memory holds", "leave it out")
     if pieces is not None and form != "crazyswarm" and pieces > 31:
-        raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed")
+        raise InputError("a vehicle's memory holds 31 pieces", where="--pieces", hint="use --to compressed, without it")
 
 
 def _check_file(form: str, output: Path, force: bool) -> None:
     """Raise InputError, before anything is planned, if the file could not be written."""
+    if output.is_dir():
+        raise InputError("that is a folder", where=str(output), hint="name a file in it")
     suffix = ".bin" if form in ("memory", "compressed") else ".csv"
     if output.suffix != suffix:
         raise InputError(

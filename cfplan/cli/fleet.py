@@ -139,7 +139,7 @@ def check_folder(folder: Path, force: bool) -> None:
 def _new_folder(folder: Path) -> Iterator[Path]:
     """Yield a folder to write to, whose files come into `folder` once all are written. Raises InputError."""
     try:
-        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.absolute().parent) as unfinished:
+        with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.resolve().parent) as unfinished:
             yield Path(unfinished)
             folder.mkdir(exist_ok=True)
             for file in Path(unfinished).iterdir():

@@ -21,6 +21,7 @@ from cfplan.flight.on_board.memory_format import MEMORY_SIZE, MOST_PIECES
 from cfplan.flight.on_board.pieces import Pieces
 from cfplan.geometry.polynomial_csv import polynomial_rows, read_polynomial_rows
 from cfplan.numbers import shown
+from cfplan.planning.plan import check_endurance
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight, plan_flight
 from cfplan.preparation.steps import OnStep, ignore_steps, step
 from cfplan.safety.certificate import certify
@@ -114,8 +115,11 @@ def fit_polynomials(
     """Fit certified polynomials to a plan, and fly them in the simulator.
 
     The form MEMORY is compressed, in at most `room` bytes, if `most` raw pieces are too few, or follow the plan less
-    closely than compressed ones. Raises NotCertifiedError if no polynomials keep the limits near the plan, or the dry
-    run fails.
+    closely than compressed ones.
+
+    Raises:
+        InfeasibleError: they take longer than the battery is trusted for.
+        NotCertifiedError: no polynomials keep the limits near the plan, or the dry run fails.
     """
     trajectory, limits = planned.plan.trajectory, planned.limits
     with step(on_step, "polynomials") as results:
@@ -131,6 +135,7 @@ def fit_polynomials(
         results.append(f"largest deviation {run.expected()}")
     if leads:
         made, run = _corrected(made, run, planned, most, room, on_step)
+    check_endurance(made.duration, limits)
     run.require_passed()
     return ExportedFlight(planned, made, run)
 
@@ -236,7 +241,7 @@ def write_samples(planned: PlannedFlight, rate: float, file: Path, wait: float =
 def sample_rows(trajectory: Trajectory, rate: float, wait: float = 0.0) -> NDArray:
     """Return (N, 18): the columns of a file of samples, SI units and rad, the quaternion body to world."""
     end = wait + trajectory.duration
-    times = np.round(np.append(np.arange(np.ceil(end * rate)) / rate, end), _DIGITS)
+    times = np.unique(np.round(np.append(np.arange(np.ceil(end * rate)) / rate, end), _DIGITS))
     state = trajectory.at(times - wait)
     return np.column_stack(
         [

@@ -60,6 +60,9 @@ def test_samples_are_those_of_the_plan(export, tmp_path):
         ("crazyswarm", "curve.bin", (), "written as .csv"),
         ("memory", "curve.csv", (), "written as .bin"),
         ("memory", "curve.bin", ("--pieces", "40"), "holds 31 pieces"),
+        ("compressed", "curve.bin", ("--pieces", "5"), "--pieces"),
+        ("crazyswarm", "curve.csv", ("--pieces", "1"), "--pieces"),
+        ("crazyswarm", ".", ("--force",), "that is a folder"),
         ("samples", "nowhere/curve.csv", (), "no such folder"),
     ],
 )
@@ -78,6 +81,6 @@ def test_nothing_is_overwritten_unasked(export, tmp_path):
 
 
 def test_errors_are_json_where_that_was_asked_for(export):
-    ended = export("crazyswarm", "curve.csv", "--pieces", "1", "--json")
+    ended = export("crazyswarm", "curve.csv", "--pieces", "2", "--json")
     assert ended.code == 4
-    assert "1 pieces" in json.loads(ended.out)["error"]
+    assert "2 pieces" in json.loads(ended.out)["error"]

@@ -135,7 +135,7 @@ class World:
         self.estimate: Estimate | None = None
         self.status: VehicleStatus | None = None
         self.position_variance = (1e-5, 1e-5, 1e-5)
-        self.acknowledged = self.now
+        self.acknowledged, self.log_heard = self.now, self.now
         self._logging = False
 
     # The clock.
@@ -207,8 +207,10 @@ class World:
             bits |= CAN_FLY if self.can_fly else 0
             motor = 4 * (round(self.hover_command) if self.motors_on else 0,)
             if not self.estimate_silent:
+                self.log_heard = self.now
                 self.estimate = Estimate(self.now, self.position, self.velocity, (0.0, 0.0, 0.0), turn)
             if not self.status_silent and self._count % self.status_every == 0:
+                self.log_heard = self.now
                 self.status = VehicleStatus(self.now, (0.0, 0.0, 0.0), motor, self.voltage, bits)
 
     # The pose source.

@@ -10,6 +10,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from waiting import PATIENCE
 
 from cfplan.errors import CfplanError
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
+from cfplan.flight.on_board.memory_format import YAW_READ_SINCE
 from cfplan.preparation.export_flight import COARSE, Form, fit_polynomials, plan_for_polynomials, write_polynomials
 from cfplan.preparation.plan_flight import FlightOptions, PlannedFlight
 from cfplan.preparation.prepare_flight import encode_flight
@@ -42,7 +44,8 @@ FLIGHTS_EACH = 5  # a single one strays by chance half a centimetre more than an
 COARSELY = {("identify", "by_crazyswarm"): 0.03}  # m: 31 raw pieces follow its 30 s to 17 mm, and leave no correction
 WORSE = 0.02  # m, by which the deviation is at most larger than that of the same plan, streamed
 HEIGHT = 0.8  # m, of take-off
-LIMITS = load_limits(REPOSITORY / "safety.yaml")
+_READ = load_limits(REPOSITORY / "safety.yaml")
+LIMITS = replace(_READ, firmware=replace(_READ.firmware, oldest=YAW_READ_SINCE))
 
 
 def snippet(heading: str) -> str:

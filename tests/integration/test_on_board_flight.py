@@ -14,11 +14,13 @@ from cfplan.flight.on_board.fall import falls_from
 from cfplan.flight.on_board.memory_format import MEMORY_SIZE, read_compressed, read_raw
 from cfplan.flight.pilot.keys import HeldOrders, Order
 from cfplan.flight.pilot.mission import mission_of
+from cfplan.flight.pilot.on_board_manoeuvres import OnBoardManoeuvres
 from cfplan.flight.pilot.outcome import Rung
 from cfplan.flight.radio.crtp import Port
 from cfplan.flight.telemetry import Phase
 from cfplan.preparation.on_board_flight import prepare_on_board_flight
 from cfplan.preparation.prepare_flight import encode_flight
+from cfplan.safety.limits import Ladder
 from cfplan.safety.limits_file import load_limits
 from cfplan.simulation.lab.radio import RadioFault, RadioFaultKind
 from cfplan.simulation.lab.stepped_lab import SteppedLab
@@ -242,6 +244,50 @@ def test_a_radio_that_dies_with_a_command_to_fly_on_leaves_no_doubt_of_what_it_f
     assert flight.outcome.rung is (Rung.NONE if dead < 0.4 else Rung.LAND)
     assert flight.truth.off_in_air[-1] == 0
     assert steepest(flight) < LIMITS.flight.stop_tilt
+
+
+def test_it_is_not_cut_while_it_rightly_leaves_the_start_unheard(line):
+    tight = replace(LIMITS.flight, deviation=Ladder(0.2, 0.35, 0.5))
+    lab = SteppedLab(LIMITS.airframe)
+    receive = lab.vehicle.firmware.planner.receive
+
+    def strike_after(payload, *rest, **more):
+        if payload[0] == START:
+            lab.disturb(RadioFault(RadioFaultKind.DEAD, 0.0, 0.75))
+        return receive(payload, *rest, **more)
+
+    lab.vehicle.firmware.planner.receive = strike_after
+    mission = replace(line.mission, limits=replace(LIMITS, flight=tight))
+    flight = fly_stepped(mission, lab=lab)
+    assert flight.outcome.rung is Rung.LAND
+    assert flight.truth.off_in_air[-1] == 0
+
+
+@pytest.mark.parametrize(("dead", "loss", "phase"), [(0.8, 0.5, 0.0), (0.85, 0.3, 0.03), (0.88, 0.0, 0.0)])
+def test_one_that_hears_again_in_time_is_landed_although_few_packets_come_through(line, dead, loss, phase):
+    lab, row = SteppedLab(LIMITS.airframe), int(2.0 * line.mission.rate)
+
+    def strike():
+        lab.disturb(RadioFault(RadioFaultKind.DEAD, phase, dead))
+        lab.disturb(RadioFault(RadioFaultKind.LOSS, phase + dead, 3.0, loss))
+
+    flight = fly_stepped(line.mission, at_setpoint(row, strike), lab=lab)
+    assert flight.outcome.rung is Rung.LAND
+    assert flight.truth.off_in_air[-1] == 0
+
+
+@pytest.mark.parametrize("step", ["_descend", "_command_stop"])
+def test_a_fault_of_the_pilot_in_a_stop_or_descent_lands_it_by_setpoints(line, monkeypatch, step):
+    def fail(*_):
+        raise ValueError("injected")
+
+    monkeypatch.setattr(OnBoardManoeuvres, step, fail)
+    orders, row = HeldOrders(), len(line.mission.payloads) // 3
+    flight = fly_stepped(line.mission, at_setpoint(row, lambda: orders.give(Order.LAND)), orders=orders)
+    assert flight.outcome.rung is Rung.LAND
+    assert "injected" in flight.outcome.reason
+    assert flight.truth.off_in_air[-1] == 0
+    assert flight.truth.position[-1, 2] == 0.0
 
 
 @pytest.mark.parametrize("command", [LAND, GO_TO])

@@ -13,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfplan.errors import NotCertifiedError
+from cfplan.flight.firmware import version_text
 from cfplan.flight.on_board.correction import Correction
 from cfplan.flight.on_board.fitting import drawn_knots, even_knots, fit_control_points, fit_pieces
 from cfplan.flight.on_board.memory_format import (
     MEMORY_SIZE,
     MOST_PIECES,
+    YAW_READ_SINCE,
     compressed_bytes,
     compressed_size,
     raw_bytes,
@@ -33,6 +35,7 @@ from cfplan.vehicle.trajectory import Trajectory
 
 FARTHEST = 0.02  # m from the reference
 SLOWEST = 1.5  # times the plan's duration
+_LEAST_PIECES = 2  # Crazyswarm cannot read a file of one
 _COUNT_FRACTIONS = (0.25, 0.5, 0.75, 1.0)  # of the largest number of pieces, to be tried
 _DURATION_TOLERANCE = 1.01  # times the least duration; within this the fit nearest to the plan is chosen
 _LENGTHS = (
@@ -107,7 +110,7 @@ def certified_pieces(
 
         return make
 
-    counts = sorted({max(1, round(most * share)) for share in _COUNT_FRACTIONS})
+    counts = sorted({max(_LEAST_PIECES, round(most * share)) for share in _COUNT_FRACTIONS})
     fits_tried = (fit_of(knots_of, count) for count in counts for knots_of in (even_knots, drawn_knots))
     reference = PolynomialReference(trajectory, leads=leads, correction=correction)
     return _best(fits_tried, reference, limits, f"{most} pieces")
@@ -123,13 +126,23 @@ def certified_compressed(
 ) -> OnBoardTrajectory:
     """Return compressed pieces that fly a trajectory within the limits, in `room` bytes at most.
 
-    Raises NotCertifiedError as above; for a flight that is too long, its message says what would fit.
+    Raises NotCertifiedError as above, or if a firmware that safety.yaml permits would misread the yaw; for a flight
+    that is too long, its message says what would fit.
     """
 
     def fit_of(count: int) -> _Fit:
         return lambda reference: _compressed(reference, count, room)
 
     reference = PolynomialReference(trajectory, leads=leads, correction=correction)
+    yaw = reference.at(np.arange(0.0, reference.duration, _COARSE))[:, 0, 3]
+    if limits.firmware.oldest < YAW_READ_SINCE and yaw.any():
+        raise NotCertifiedError(
+            f"firmware before {version_text(YAW_READ_SINCE)} misreads the yaw of compressed pieces, and safety.yaml "
+            f"permits {version_text(limits.firmware.oldest)}",
+            where="trajectory memory",
+            hint="update every vehicle and raise `firmware.oldest`, plan with a fixed yaw of 0, or fly a shorter path, "
+            "for which uncompressed pieces suffice",
+        )
     counts = {max(1, int(np.ceil(reference.duration / length))) for length in _LENGTHS}
     fullest = _max_count_that_fits(reference, max(counts), room)
     if fullest == max(counts):
@@ -190,7 +203,7 @@ def _best(fits_tried: Iterable[_Fit], reference: PolynomialReference, limits: Li
     if not good:
         raise NotCertifiedError(
             f"within {room}: {min(flaws)[1]}", where="polynomials",
-            hint="use more pieces, compressed ones if need be, or plan with lower limits",
+            hint="use more pieces, compressed ones if need be, plan with lower limits, or keep farther from walls",
         )  # fmt: skip
     least = min(made.duration for made in good)
     return min((made for made in good if made.duration <= _DURATION_TOLERANCE * least), key=lambda made: made.error)

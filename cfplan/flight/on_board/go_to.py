@@ -6,7 +6,8 @@ pptraj.c, poly4d_set_no_jerk). With u = t/T from 0 to 1:
 
     x(u) = p + vT u + ½aT² u² + c₄u⁴ + c₅u⁵ + c₆u⁶ + c₇u⁷
 
-A stop flies to the target with the least integral of squared jerk: p + ½ vT + 5/56 aT².
+A stop flies to the target with the least integral of squared jerk: p + ½ vT + 5/56 aT², but turns less than half way
+round.
 """
 
 from math import factorial
@@ -20,6 +21,7 @@ from cfplan.flight.setpoints.packets import FullStateSetpoints
 from cfplan.vehicle.airframe import GRAVITY, Airframe
 from cfplan.vehicle.rotations import about_z, quaternions_of
 
+MOST_TURN = 3.0  # rad, of a stop; beyond half a turn the firmware would turn the other way round
 STOP_DURATION = 1.0  # s
 """From 2 m/s the vehicle brakes at 3.8 m/s² and stops within 1 m; on all of flights/ this keeps the limits of stops."""
 _ORDERS = 5  # position to snap
@@ -58,7 +60,9 @@ def stop_targets(begin: NDArray, duration: float = STOP_DURATION) -> NDArray:
     """Return where stops from K states, (K, 3, 4), end: (K, 4) in m and rad."""
     begin = np.array(begin, dtype=float)
     begin[:, 2, 3] = 0.0
-    return np.asarray(begin[:, 0] + 0.5 * duration * begin[:, 1] + 5.0 / 56.0 * duration**2 * begin[:, 2])
+    way = 0.5 * duration * begin[:, 1] + 5.0 / 56.0 * duration**2 * begin[:, 2]
+    way[:, 3] = np.clip(way[:, 3], -MOST_TURN, MOST_TURN)
+    return np.asarray(begin[:, 0] + way)
 
 
 def motion_of(states: NDArray, airframe: Airframe) -> FullStateSetpoints:

@@ -24,6 +24,7 @@ MOST_PIECES = MEMORY_SIZE // PIECE_SIZE
 POINTS = COUNT - 1  # most stored control points of a piece
 STEPS = np.array([1e-3, 1e-3, 1e-3, np.radians(0.1)])  # m, m, m, rad: one in a stored control point
 LONGEST = 65.535  # s, of a compressed piece
+YAW_READ_SINCE = (2026, 8)  # the first firmware that reads the yaw of compressed pieces in 0.1°; earlier: in 10 rad
 _POINTS_OF_TYPE = (0, 1, 3, POINTS)
 _SCALES = np.array([1000.0, 1000.0, 1000.0, np.float32(1800.0) / np.float32(np.pi)], dtype=np.float32)
 _HEADER = struct.Struct("<BH")
@@ -87,11 +88,15 @@ def compressed_bytes(curve: ControlPoints, room: int = MEMORY_SIZE) -> bytes:
             f"{size} bytes, but the vehicle's memory holds {room}", where="trajectory memory",
             hint="use fewer, longer pieces",
         )  # fmt: skip
-    highest = max(np.abs(curve.points).max(), np.abs(curve.start).max())
-    if highest > 32767 or curve.durations.min() < 1 or curve.durations.max() > 65535:
+    if max(np.abs(curve.points).max(), np.abs(curve.start).max()) > 32767:
         raise NotCertifiedError(
-            "a control point beyond 32.767 m or 3276.7°, or a duration not from 1 to 65535 ms",
-            where="trajectory memory", hint="move the path nearer to the origin, or turn less",
+            "a control point beyond 32.767 m or 3276.7°", where="trajectory memory",
+            hint="move the path nearer to the origin, or turn less",
+        )  # fmt: skip
+    if curve.durations.min() < 1 or curve.durations.max() > 1000 * LONGEST:
+        raise NotCertifiedError(
+            f"a compressed piece lasts from 0.001 to {LONGEST:g} s", where="trajectory memory",
+            hint="fly faster, or wait less",
         )  # fmt: skip
     parts = [_START.pack(*curve.start.tolist())]
     for duration, points, moving in zip(curve.durations.tolist(), curve.points, moves, strict=True):

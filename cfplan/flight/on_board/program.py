@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cfplan.errors import NotCertifiedError
 from cfplan.flight.on_board.certified_pieces import OnBoardTrajectory
 from cfplan.flight.on_board.memory_format import (
     END,
+    LONGEST,
     POINTS,
     START_SIZE,
     STEPS,
@@ -74,13 +76,21 @@ def _end_of(table: NDArray, duration: float) -> NDArray:
 
 
 def _sinking(end: NDArray, floor: float, mean_speed: float) -> ControlPoints:
-    """Return the two pieces of the landing, in whole steps of compressed memory, from a rest at `end`, (4,), to one."""
+    """Return the two pieces of the landing, in whole steps of compressed memory, from a rest at `end`, (4,), to one.
+
+    Raises NotCertifiedError if the landing is too slow for two pieces.
+    """
     start = np.round(end / STEPS).astype(int)
     lowest = round(1000 * (floor - _BENEATH_FLOOR))
     way = max(int(start[2]) - round(1000 * (floor + _SLOW_FROM)), 0)
     quick = _PERIOD * math.ceil(max(_SHORTEST, way / 1000 / mean_speed) * 1000 / _PERIOD)
     step = quick // _PERIOD  # mm from one control point to the next, at the pace to touch the floor
     middle = int(start[2]) - max(way, 3 * step)
+    if middle <= lowest or quick > 1000 * LONGEST:
+        raise NotCertifiedError(
+            f"sinking {way / 1000:.1f} m at {mean_speed:g} m/s takes {quick / 1000:.0f} s, too long for two pieces",
+            where="landing", hint="raise `ground.land_speed` in safety.yaml",
+        )  # fmt: skip
     slow = _PERIOD * max(round((middle - lowest) / 7), 1)
     points = np.tile(start[:, None], (2, 1, 7))
     points[0, 2, 3:] = middle + step * np.arange(3, -1, -1)

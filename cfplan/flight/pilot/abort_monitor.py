@@ -23,6 +23,7 @@ from cfplan.safety.space import inside
 LATEST_SETPOINT = 0.25  # s, latest setpoint; the vehicle stops following after 0.5 s
 DISAGREEMENT_FACTOR = 5.0  # times preflight's limit on the distance between estimate and pose, in the air
 _HEARD_SINCE = 0.1  # s; packets may have arrived this much later than the last ping that was answered
+_QUEUE = 0.4  # s, for which logs of an outage may come before the answer to a ping; a restarted vehicle sends no logs
 FALLEN = 0.15  # m; a vehicle on the floor that is farther below its setpoint has fallen
 
 
@@ -42,6 +43,7 @@ class Observation:
     status: VehicleStatus | None = None  # None while its log is gone
     late: float = 0.0  # s, lateness of the last setpoint
     uplink_silent: float = 0.0  # s, for which nothing has been acknowledged
+    logs_silent: float = math.inf  # s, for which no log message has arrived, however old
 
 
 # When each quantity that has a ladder was measured, s, and its value; None while the log that reports it is gone.
@@ -85,7 +87,8 @@ class AbortMonitor:
         """Return the abort that the present health calls for; its text names the most important silent source."""
         health, pose = observation.health, observation.pose
         rung, age_brake = health.reaction.rung, self._limits.pose.age_brake
-        if observation.uplink_silent > self._alone_after:
+        queue = _QUEUE if observation.logs_silent < _HEARD_SINCE else 0.0
+        if observation.uplink_silent > self._alone_after + queue:
             # It has stopped its motors, and may have restarted since: it must not be flown from where it lies.
             reason = f"nothing was acknowledged for {observation.uplink_silent:.1f} s"
             return AbortReason.LINK_LOST.abort(Rung.CUT, reason=reason)

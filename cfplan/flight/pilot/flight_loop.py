@@ -99,6 +99,7 @@ class FlightLoop:
         self.commitment = Commitment(0, mission.payloads, mission.stops)
         self.plan = stream_of(self.commitment, mission.rate, on_board=mission.on_board is not None)
         self.stream: Stream | None = None  # what each tick sends
+        self._in_doubt = False  # whether the vehicle may have left its stream, by a command that it has not answered
         self._unheard = False
         """Whether the vehicle was without setpoints for so long that it left its stream; until `hold_where_it_is`."""
         self._sent_at = math.inf  # s, when the last setpoint was sent
@@ -182,6 +183,10 @@ class FlightLoop:
         self.plan = self.begin(self.plan, commanded)
         self.history.first_setpoint = self.plan.start
         self._proposals.begin(self.plan.start)
+
+    def doubt_stream(self, doubt: bool) -> None:
+        """While the vehicle may have left its stream, do not compare its position with it."""
+        self._in_doubt = doubt
 
     def end_stream(self) -> None:
         """Stop sending setpoints."""
@@ -311,7 +316,8 @@ class FlightLoop:
 
     def _keep_alive(self, now: float) -> None:
         watched = self.airborne or self.watched  # until the link closes; the vehicle locks 1 s later
-        if watched and self.limits.firmware.watchdog and now - self._kept_alive > _KEEP_ALIVE_PERIOD:
+        due = now - self._kept_alive > _KEEP_ALIVE_PERIOD or self.health.uplink is not FRESH  # most packets are lost
+        if watched and self.limits.firmware.watchdog and due:
             self._kept_alive = now
             self.link.keep_alive()
 
@@ -407,15 +413,17 @@ class FlightLoop:
         if not self.airborne or self._stopped():
             return
         pose, estimate = self.tracker.last, self.estimate
+        compared = not self._in_doubt
         observation = Observation(
             now=now,
             uplink_silent=silent,
+            logs_silent=now - self.link.log_heard,
             pose=pose,
             pose_fault=self.pose_fault,
             health=self.health,
-            setpoint_at_pose=self.setpoint_position(pose.time) if pose is not None else None,
+            setpoint_at_pose=self.setpoint_position(pose.time) if compared and pose is not None else None,
             estimate=estimate,
-            setpoint_at_estimate=self.setpoint_position(estimate.time) if estimate is not None else None,
+            setpoint_at_estimate=self.setpoint_position(estimate.time) if compared and estimate is not None else None,
             status=self.status,
             late=late if self.stream is not None and not self.stream.on_board else 0.0,
         )

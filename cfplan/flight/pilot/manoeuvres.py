@@ -40,6 +40,9 @@ class Manoeuvres(Protocol):
     def land(self) -> None:
         """Land after the plan, and stop the motors."""
 
+    def land_by_setpoints(self) -> None:
+        """Land by setpoints from wherever the vehicle is: the last resort before its motors are cut."""
+
     def brake(self) -> None:
         """Leave the plan: brake to a hover, hold it, and land."""
 

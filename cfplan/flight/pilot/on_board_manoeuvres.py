@@ -157,6 +157,21 @@ class OnBoardManoeuvres:
         loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > down.end + _SETTLE_TIME, math.inf)
         self._end_landing()
 
+    def land_by_setpoints(self) -> None:
+        """Stop by setpoints, unless they have stopped it already, and land by them."""
+        loop, left = self._loop, self._loop.stream
+        loop.doubt_stream(False)
+        if left is not None and left.on_board:
+            if left.stop_from is None:  # it may not have followed the last descent
+                loop.hold_where_it_is()
+            else:
+                end = loop.begin(Stream(left.stop_from(left.index(loop.now())), self._mission.rate)).end
+                loop.until(lambda: loop.now() > end, math.inf)
+        self._begin_landing()
+        landing = Landing(loop, self._floor)
+        landing.begun = True
+        landing.land()
+
     def brake(self) -> None:
         """Brake to a hover, hold it, and land."""
         self._stop()
@@ -180,6 +195,7 @@ class OnBoardManoeuvres:
             loop.link.replies.pop(number, None)
             loop.link.command(command)
             self._departure = _Departure(number, loop.now(), begin)
+            loop.doubt_stream(True)
             answer = self._answer_to_departure()
             if answer is not None:
                 break
@@ -203,6 +219,7 @@ class OnBoardManoeuvres:
 
         loop.until(lambda: answer() is not None or logged() or loop.health.status_unknown, math.inf)
         self._departure = None
+        loop.doubt_stream(False)
         flies = answer() is None and logged() and not loop.bits(TRAJECTORY_FINISHED)
         if flies or answer() == commands.DONE:
             departure.begin(departure.sent)
@@ -287,7 +304,7 @@ class OnBoardManoeuvres:
         (x, y, z), _, yaw = loop.setpoint_now()
         self._begin_landing()
         if not loop.stream.on_board:  # setpoints stopped it, and outrank its commander
-            self._land_by_setpoints()
+            self.land_by_setpoints()
             return
         lowest = self._floor - (_BLIND_LANDING_DEPTH if loop.health.poses is GONE else _LANDING_DEPTH)
         way = max(z - lowest, 0.0)
@@ -300,16 +317,11 @@ class OnBoardManoeuvres:
             self._history.add_event(
                 Level.WARNING, f"the vehicle does not land: {_answer_text(answer)}; setpoints land it"
             )
-            self._land_by_setpoints()
+            self.land_by_setpoints()
             return
         end = loop.stream.end + _SETTLE_TIME
         loop.until(lambda: stands_by_poses(loop, self._floor) or loop.now() > end, math.inf)
         self._end_landing()
-
-    def _land_by_setpoints(self) -> None:
-        landing = Landing(self._loop, self._floor)
-        landing.begun = True
-        landing.land()
 
     def _end_landing(self) -> None:
         """Stop the motors. Raises AbortRaised if they do not stop."""

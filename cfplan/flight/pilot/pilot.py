@@ -97,7 +97,7 @@ class Pilot:
     def _leave_plan(self, abort: Abort) -> tuple[ExitCode, str]:
         """Descend the abort ladder to the ground; return the exit code and the reason."""
         loop, flown = self._loop, self._manoeuvres
-        descents = [flown.land, flown.stop_and_land]  # the last one is tried; if it fails it is removed
+        descents = [flown.land_by_setpoints, flown.stop_and_land]  # the last one is tried; if it fails it is removed
         exit_code, reasons, self._history.hint = abort.exit_code, [abort.text], abort.cure
         while True:
             self._history.rung = max(self._history.rung, abort.rung)

@@ -89,6 +89,10 @@ class StreamedManoeuvres:
         """Land by setpoints, and stop the motors."""
         self._landing.land()
 
+    def land_by_setpoints(self) -> None:
+        """Land, as always, by setpoints."""
+        self._landing.land()
+
     def brake(self) -> None:
         """Brake to a hover along the plan, hold it, and land."""
         loop = self._loop

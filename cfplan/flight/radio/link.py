@@ -60,7 +60,7 @@ class Link:
         self._preflight_blocks: list[LogBlock] = []
         self._log_recreation: dict[str, Iterator[bytes | None]] = {}  # packets that recreate a log, by its name
         # s: zero of the vehicle's clock according to the quickest messages; arrival of the last message
-        self._log_zero, self._log_heard = math.inf, 0.0
+        self._log_zero, self.log_heard = math.inf, 0.0
         session.listen(Port.HIGH_LEVEL, self._on_reply)
         session.listen(Port.PARAMETERS, self._on_parameter)
 
@@ -217,8 +217,8 @@ class Link:
         zero = now - stamp_ms * _MILLI
         if math.isinf(self._log_zero) or abs(zero - self._log_zero - _STAMPS_WRAP) < _WRAP_TOLERANCE:
             self._log_zero = zero  # the first message, or the 24 bits wrapped; after a restart all messages seem old
-        self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self._log_heard), zero)
-        self._log_heard = now
+        self._log_zero = min(self._log_zero + _CLOCK_DRIFT * (now - self.log_heard), zero)
+        self.log_heard = now
         return self._log_zero + stamp_ms * _MILLI
 
     def _on_estimate(self, stamp_ms: int, data: dict[str, Any]) -> None:
