@@ -56,7 +56,7 @@ def _range(_: click.Context, __: click.Parameter, text: str) -> tuple[int, ...]:
 @click.option(
     "--safety", type=click.Path(path_type=Path), help="Take vehicle and limits from this safety.yaml instead."
 )
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), default=0, show_default=True)
 @click.option(
     "--box",
     "boxes",

@@ -7,6 +7,7 @@ import click
 
 from cfplan.cli import options
 from cfplan.cli.output import Steps, print_json, print_table
+from cfplan.errors import InputError
 
 if TYPE_CHECKING:
     from cfplan.identification.quantities import Identification
@@ -47,6 +48,8 @@ def identify(records: tuple[Path, ...], mass: float | None, output: Path, force:
 
     steps, read = Steps(as_json=as_json), []
     check_target(output, overwrite=force)
+    if len({place.resolve() for place in records}) < len(records):
+        raise InputError("the same record is given twice", where="RECORD", hint="name each record once")
     for place in records:
         with steps.step("read") as results:
             read.append(read_record(place))

@@ -1,5 +1,6 @@
 """`cfplan validate`: predict logged flights, and compare with the logs."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from cfplan.identification.logged_flight import LoggedFlight
     from cfplan.identification.reference import ReferenceMotion
     from cfplan.identification.validate import Validation
+    from cfplan.vehicle.airframe import Airframe
 
 AIRFRAME_FILE = Path("airframe.yaml")
 _DEFAULT_VEHICLE = "crazyflie-2.1+"
@@ -24,8 +26,8 @@ _OF_LOGS = "gains", "polynomials", "time_scale", "plan", "offset"  # parameters 
     short_help="Predict logged flights and compare them with the log.",
     epilog="""\b
 Examples:
-  cfplan validate log76 --gains info76.yaml --mass 0.0375
-  cfplan validate log76 --gains info76.yaml --polynomials translation_y.csv --time-scale 0.75
+  cfplan validate log.bin --gains gains.yaml --mass 0.0375
+  cfplan validate log.bin --gains gains.yaml --polynomials flown.csv --time-scale 0.75
   cfplan validate records/20261122-094221-figure8 --report validation.html""",
 )
 @click.argument("logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path))
@@ -39,15 +41,27 @@ Examples:
     help="Time scale of the polynomials.",
 )
 @click.option("--plan", type=click.Path(path_type=Path), help="Plan flown from the vehicle's memory, Parquet.")
-@click.option("--offset", type=float, nargs=3, help="Place of the trajectory's origin, m, if setpoints are not logged.")
+@click.option(
+    "--offset",
+    type=options.FiniteRange(),
+    nargs=3,
+    help="Place of the trajectory's origin, m, if setpoints are not logged.",
+)
 @click.option(
     "--mass",
     type=options.FiniteRange(0, min_open=True),
     help="Mass with battery, kg.  [default: that of --vehicle, else the controller's]",
 )
 @click.option("--vehicle", help="Airframe, by name or file.  [default: the record's, or crazyflie-2.1+]")
-@click.option("--from", "begin", type=float, default=0.0, show_default=True, help="Start of the part to validate, s.")
-@click.option("--to", "end", type=float, default=float("inf"), help="End of the part to validate, s.  [default: all]")
+@click.option(
+    "--from",
+    "begin",
+    type=options.FiniteRange(0),
+    default=0.0,
+    show_default=True,
+    help="Start of the part to validate, s.",
+)
+@click.option("--to", "end", type=options.FiniteRange(0), help="End of the part to validate, s.  [default: all]")
 @click.option("--report", type=click.Path(path_type=Path, dir_okay=False), help="Page to write, with both curves.")
 @click.option(
     "-o",
@@ -74,15 +88,17 @@ def validate(
     steps = Steps(as_json=as_json)
     _check_options(logs, output, report, force)
     found: list[Validation] = []
+    vehicles: list[Airframe] = []
     for place in logs:
         with steps.step("read") as results:
             flight = _read(place, **given)
+            vehicles.append(flight.airframe)
+            check_same_vehicle(vehicles, place)
             results.append(f"{place.name}, {flight.log.duration:.1f} s, along {flight.reference.source}")
         with steps.step("predict") as results:
-            found.append(
-                fly_again(flight.log, flight.reference, flight.controller, flight.airframe, flight.poses)
-            )  # fmt: skip
-            results.append(verdict(found[-1]))
+            predicted = fly_again(flight.log, flight.reference, flight.controller, flight.airframe, flight.poses)
+            found.append(predicted)
+            results.append(verdict(predicted))
     with steps.step("airframe") as results:
         kind = found[0].measured.airframe
         write_airframe(
@@ -106,9 +122,22 @@ def _check_options(logs: tuple[Path, ...], output: Path, report: Path | None, fo
 
     if all(map(_is_record, logs)):
         options.refuse(_OF_LOGS, "this is for microSD logs: a record holds its controller and its plan", "leave it out")
+    if report is not None and report.resolve() == output.resolve():
+        raise InputError("that is the airframe's file", where=str(report), hint="another name after --report or -o")
     check_target(output, overwrite=force)
     if report is not None:
         check_new_file(report, overwrite=force)
+
+
+def check_same_vehicle(vehicles: "list[Airframe]", place: Path) -> None:
+    """Raise InputError unless the last flight is by the vehicle of the first one."""
+    before, airframe = vehicles[0], vehicles[-1]
+    if (airframe.name, airframe.mass) != (before.name, before.mass):
+        raise InputError(
+            f"{airframe.name} of {1000 * airframe.mass:.1f} g flew, in the first log {before.name} of "
+            f"{1000 * before.mass:.1f} g",
+            where=str(place), hint="validate each vehicle by itself",
+        )  # fmt: skip
 
 
 def _is_record(place: Path) -> bool:
@@ -117,7 +146,7 @@ def _is_record(place: Path) -> bool:
 
 def _read(
     place: Path, *, gains: Path | None, polynomials: Path | None, time_scale: float, plan: Path | None,
-    offset: tuple[float, float, float] | None, mass: float | None, vehicle: str | None, begin: float, end: float,
+    offset: tuple[float, float, float] | None, mass: float | None, vehicle: str | None, begin: float, end: float | None,
 ) -> "LoggedFlight":  # fmt: skip
     """Return a flight, its reference begun as flown. One parameter per option of the command."""
     from cfplan.identification.flight_log import read_microsd
@@ -126,6 +155,10 @@ def _read(
     from cfplan.recording.reader import read_record
     from cfplan.vehicle.airframes import load_airframe
 
+    if end is None:
+        end = math.inf
+    if end <= begin:
+        raise InputError("no part of a flight ends before it begins", where="--to", hint="a time later than --from")
     airframe = load_airframe(vehicle) if vehicle else None
     if _is_record(place):
         flight = flight_of_record(read_record(place), begin, end)

@@ -205,7 +205,7 @@ def _geometry(models: Sequence[FlightModel], solution: FittedUnknowns) -> dict[s
     for axis, value, std in zip("xy", centre, spread, strict=True):
         found[f"centre of mass {axis}"] = IdentifiedQuantity(
             f"centre of mass, {axis} from the motors' middle", float(value), float(std), "mm", 0.0, 2,
-            remark="or motors that differ as much", scale=1e3,
+            remark="or motors that differ as much, or the air's moment in flight mostly forwards", scale=1e3,
         )  # fmt: skip
     return found
 

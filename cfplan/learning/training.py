@@ -26,7 +26,7 @@ from cfplan.errors import InputError
 from cfplan.learning import features, inference
 from cfplan.learning.checkpoints import Epoch, draw_curves, resume, save_checkpoint
 from cfplan.learning.learned import Query, predict
-from cfplan.learning.model_files import Card, load_card, load_weights, save_model
+from cfplan.learning.model_files import CARD, Card, load_card, load_weights, save_model
 from cfplan.learning.networks import Architecture, build
 from cfplan.learning.smooth import travel_time
 from cfplan.learning.training_set import Labels, TrainingSet, draw, read_training_set, split
@@ -70,7 +70,7 @@ class Options:
             ("batch", self.batch < 1, "at least 1"),
             ("rate", not 0 < self.rate < 1, "between 0 and 1"),
             ("epsilon", not 0 <= self.epsilon < float("inf"), "at least 0"),
-            ("seed", self.seed < 0, "at least 0"),
+            ("seed", not 0 <= self.seed < 2**63, "at least 0 and below 2^63"),
         ]
         for name, is_wrong, allowed in wrong:
             if is_wrong:
@@ -93,8 +93,8 @@ def train(
     """Train, or resume the training in the folder, and write the model. Returns None in all processes but the first.
 
     Raises:
-        InputError: a dataset without usable rows, another training in the folder, a start of another architecture,
-            a device that is not there, or a loss that is not a number.
+        InputError: a dataset without usable rows, another training or a model in the folder, a start of another
+            architecture, a device that is not there, or a loss that is not a number.
     """
     return train_on(read_training_set(dataset), folder, options, device=device, command=command, on_epoch=on_epoch)
 
@@ -112,6 +112,8 @@ def train_on(
     with processes(device) as (rank, world, place):
         run = _Run(training_set, folder, options, rank, world, place)
         try:
+            if rank == 0 and run.log and run.improved:
+                run.save(command)  # it may have been killed between checkpoint and model
             for epoch in run.epochs():
                 if rank == 0 and run.improved:
                     run.save(command)
@@ -152,6 +154,8 @@ class _Run:
         self.batches = per_process // self.batch
         self.unseen_windows = self._windows(self.unseen, np.tile(np.arange(len(self.unseen.rows)), 2), _UNSEEN, 0)
         self.log = resume(folder, self.identity, self.network, self.optimiser, place)
+        if rank == 0 and not self.log and (folder / CARD).exists():
+            raise InputError("holds a model without its training", where=str(folder), hint="name another folder")
 
     def epochs(self) -> Iterator[Epoch]:
         """Train and yield epoch by epoch."""

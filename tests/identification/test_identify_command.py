@@ -54,6 +54,10 @@ def test_a_place_that_cannot_be_written_is_refused(tmp_path, output):
     assert error.hint
 
 
+def test_a_record_counts_once(record, tmp_path):
+    assert "twice" in str(refused(record.folder, record.folder, "-o", tmp_path / "cf.yaml"))
+
+
 def test_what_is_no_record_is_refused(tmp_path):
     assert "no such record" in str(refused(tmp_path / "none", "-o", tmp_path / "cf.yaml"))
     assert not list(tmp_path.iterdir())

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
 from cfplan.cli import cfplan
+from cfplan.cli.validate import check_same_vehicle
 from cfplan.errors import CfplanError, ExitCode
 from cfplan.identification.airframe_yaml import write_airframe
 from cfplan.identification.flight_log import read_microsd
@@ -178,3 +179,32 @@ def test_the_record_of_a_vehicle_as_real_ones_are_is_predicted(limits, tmp_path)
     assert as_it_is.comparison.explained > as_planned.comparison.explained + 0.3
     assert as_it_is.ablations["moment"].explained < as_it_is.comparison.explained - 0.3
     assert any("torque" in reason for reason in as_it_is.measured.unknown)
+
+
+def test_flights_of_two_vehicles_are_not_pooled(folder, tmp_path):
+    for name, mass in (("a", 0.03), ("b", 0.04)):
+        write_airframe(replace(PLAIN, name=name, mass=mass), tmp_path / f"{name}.yaml")
+    vehicles = [read_airframe(tmp_path / f"{name}.yaml") for name in "ab"]
+    with pytest.raises(CfplanError, match=r"b of 40.0 g flew, in the first log a of 30.0 g"):
+        check_same_vehicle(vehicles, folder / "log00")
+
+
+@pytest.mark.parametrize("words", [("--from", "-5"), ("--to", "nan"), ("--offset", "nan", "0", "0")])
+def test_times_and_places_are_finite_numbers(folder, tmp_path, words):
+    result = run(folder / "log00", "--gains", folder / "gains.yaml", *words, "-o", tmp_path / "found.yaml")
+    assert result.exit_code == 2
+    assert words[0] in result.output
+
+
+def test_a_part_that_ends_before_it_begins_is_refused(folder, tmp_path):
+    error = refused(
+        folder / "log00", "--gains", folder / "gains.yaml", "--from", 3, "--to", 2, "-o", tmp_path / "found.yaml"
+    )
+    assert error.where == "--to"
+
+
+def test_airframe_and_page_are_two_files(folder, tmp_path):
+    file = tmp_path / "found.yaml"
+    error = refused(folder / "log00", "--gains", folder / "gains.yaml", "-o", file, "--report", file)
+    assert error.where == str(file)
+    assert not file.exists()

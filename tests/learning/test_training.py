@@ -78,6 +78,30 @@ def test_a_killed_training_goes_on_as_if_it_had_not_been(trained, tiny, tmp_path
     assert (tmp_path / "weights.safetensors").read_bytes() == (trained[0] / "weights.safetensors").read_bytes()
 
 
+def test_a_model_without_its_training_is_not_overwritten(trained, tiny, tmp_path):
+    folder = tmp_path / "shipped"
+    shutil.copytree(trained[0], folder)
+    (folder / CHECKPOINT).unlink()
+    before = {file.name: file.read_bytes() for file in folder.iterdir()}
+    with pytest.raises(InputError, match="model without its training"):
+        train(tiny, folder, SMALL)
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+def test_a_training_killed_between_checkpoint_and_model_ends_with_its_best_network(tiny, tmp_path, monkeypatch):
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    once = replace(SMALL, epochs=1)
+    monkeypatch.setattr(training, "save_model", killed)
+    with pytest.raises(KeyboardInterrupt):
+        train(tiny, tmp_path, once)
+    monkeypatch.undo()
+    train(tiny, tmp_path, once)
+    kept = float(log_of(tmp_path)[0]["unseen_loss"])
+    assert load_model(tmp_path).card.scores["unseen_loss"] == pytest.approx(kept, rel=1e-3)
+
+
 def test_a_finished_training_is_not_begun_again(trained, tiny):
     heard = []
     train(tiny, trained[0], SMALL, on_epoch=heard.append)
@@ -136,6 +160,12 @@ def test_a_loss_that_is_no_number_ends_the_training(tiny, tmp_path, monkeypatch)
     with pytest.raises(InputError, match=r"epoch 1 is not a number"):
         train(tiny, tmp_path, SMALL)
     assert not (tmp_path / CHECKPOINT).exists()
+
+
+@pytest.mark.parametrize("seed", [-1, 2**64])
+def test_seeds_fit_the_generator(seed):
+    with pytest.raises(InputError, match="seed"):
+        replace(SMALL, seed=seed)
 
 
 @pytest.mark.parametrize(
